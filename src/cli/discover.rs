@@ -203,7 +203,7 @@ fn feed(
     channels: Vec<(String, String)>,
     discoverer: &mut Discoverer,
 ) -> Result<(LogCounts, Vec<String>), Failure> {
-    let csv = CsvOptions { columns: Vec::new(), charge_positive: false, start_times: None, cells: 1, pack_total: true };
+    let csv = CsvOptions { cells: 1, series: 1, pack_total: true, ..CsvOptions::default() };
     let encode_row = Box::new(|_: &[_], _: &mut Vec<_>| 0);
     let options = LogOptions { interfaces: Vec::new(), channels, strict: false, csv, encode_row };
     let mut source = LogSource::new(logs.to_vec(), options);

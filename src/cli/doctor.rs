@@ -9,12 +9,13 @@ mod page;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use super::common::logs::{CsvSign, channel, column};
+use super::common::logs::{CsvSign, channel, charge_positive, column, print_tables};
 use super::common::numbers::above_0_to;
 use super::common::output::{failure, print_json, unless_closed};
 use super::common::progress::{Bar, progress_bar};
 use packwatch_host::failure::{EXIT_CONFIG, Failure};
 
+use crate::io::csv_log::has_table_name;
 use crate::replay::{LogReading, ReplayProgress};
 use crate::wiring::{Severity, Topic, WiringFinding, WiringReport};
 use crate::wiring_check::{self, Interrupt, Survey};
@@ -45,9 +46,9 @@ pub(crate) struct Args {
     /// Name a CSV column, as for `replay`
     #[arg(long = "column", value_name = "ROLE=NAME", value_parser = column)]
     columns: Vec<(String, String)>,
-    /// Direction of positive current in a CSV
-    #[arg(long, value_enum, default_value = "discharge")]
-    csv_sign: CsvSign,
+    /// Direction of positive current in a CSV, as for `replay`
+    #[arg(long, value_enum)]
+    csv_sign: Option<CsvSign>,
     /// CSV table with the start time of each section of a CSV log, as for `replay`
     #[arg(long, value_name = "TABLE.csv")]
     start_times: Option<PathBuf>,
@@ -57,7 +58,7 @@ pub(crate) struct Args {
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let mut survey = wiring_check::survey(&args.config)?;
     rename_interfaces(args, &mut survey)?;
-    survey.plan.is_csv = args.logs.iter().any(|log| is_csv(log));
+    survey.plan.is_csv = args.logs.iter().any(|log| has_table_name(log));
     let interrupt = Interrupt::watch().map_err(|error| Failure::new(format!("cannot handle Ctrl-C: {error}")))?;
     let mut report = if args.logs.is_empty() {
         listen(args, &survey, &interrupt)?
@@ -87,7 +88,7 @@ impl Args {
             strict: false,
             channels: self.channels.clone(),
             columns: self.columns.clone(),
-            charge_positive: self.csv_sign == CsvSign::Charge,
+            charge_positive: charge_positive(self.csv_sign),
             start_times: self.start_times.clone(),
         }
     }
@@ -107,11 +108,6 @@ fn rename_interfaces(args: &Args, survey: &mut Survey) -> Result<(), Failure> {
         interface.name.clone_from(name);
     }
     Ok(())
-}
-
-fn is_csv(log: &Path) -> bool {
-    let name = log.file_name().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
-    name.trim_end_matches(".gz").trim_end_matches(".zst").ends_with(".csv")
 }
 
 fn source_name(args: &Args, survey: &Survey) -> String {
@@ -155,6 +151,7 @@ fn replay(
     });
     bar.clear();
     let (mut report, counts) = result.map_err(failure)?;
+    print_tables(&counts.tables);
     if counts.bad_lines > 0 {
         let first = counts.first_bad_line.unwrap_or_default();
         let mut finding = WiringFinding::new(Severity::Note, Topic::Interface, "the log has malformed lines");

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use super::common::label::{LabelArgs, one_of_chemistries};
-use super::common::logs::{InputArgs, log_options};
+use super::common::logs::{InputArgs, log_options, print_tables, table_options};
 use super::common::numbers::{finite, integer};
 use super::common::output::{failure, print, unless_closed};
 use super::common::progress::progress_bar;
@@ -139,6 +139,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     };
     bar.finish_and_clear();
     let outcome = result?;
+    print_tables(&outcome.tables);
     lab::write_file(&args.out, fit::text(&request, &outcome).as_bytes()).map_err(failure)?;
     if let Some(path) = &args.plot {
         fit::write_plot(path, &outcome).map_err(failure)?;
@@ -193,6 +194,7 @@ fn request(args: &Args) -> FitRequest {
         temperature_c: args.grid.temperatures.clone(),
         soc: args.grid.soc_nodes.as_ref().map(|nodes| nodes.0.clone()),
         first_cycles: args.first_cycles,
+        table: table_options(&args.input),
         files: args.files.clone(),
     }
 }

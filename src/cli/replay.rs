@@ -8,7 +8,7 @@ mod report;
 use std::io;
 use std::path::Path;
 
-use super::common::logs::log_options;
+use super::common::logs::{log_options, print_tables};
 use super::common::output::{failure, print_json};
 use super::common::progress::Bar;
 use crate::config::{self, Config};
@@ -60,6 +60,7 @@ fn replay_all(
     let monitor = Monitor::new(config.monitor);
     let result = replay::run(source, monitor, sinks, settings, &mut |progress| bar.show(progress));
     bar.clear();
+    print_tables(&source.counts().tables);
     let (summary, snapshot) = result?;
     if let (Some(path), Some(snapshot)) = (&args.snapshot, snapshot) {
         snapshot_file::write(path, &snapshot)?;
@@ -73,6 +74,7 @@ fn play(args: &Args, source: &mut LogSource, settings: &ReplaySettings, interfac
     let bar = Bar::new(&args.logs);
     let result = replay::play(source, settings, &mut |_, frame| sender.send(frame), &mut |p| bar.show(p));
     bar.clear();
+    print_tables(&source.counts().tables);
     let sent = result?;
     report::played(sent, interface, source.counts(), args.json)?;
     Ok(())

@@ -5,6 +5,7 @@ mod bar;
 
 pub(crate) use args::Args;
 
+use super::common::logs::print_tables;
 use super::common::output::{failure, print};
 use packwatch_host::failure::Failure;
 
@@ -15,5 +16,8 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let report = run.run(&|index, part| bar.advance(index, part));
     bar.clear();
     let report = report.map_err(failure)?;
+    let mut tables: Vec<_> = report.scores.iter().map(|score| score.reading.clone()).collect();
+    tables.dedup();
+    print_tables(&tables);
     print(&if args.output.json { report.json().map_err(failure)? } else { report.table() })
 }

@@ -16,6 +16,7 @@ use nix::errno::Errno;
 
 use crate::can::encode::{InputEncoder, InputProtector};
 use crate::io::clock::{MappedClock, Reading};
+use crate::io::csv_log::CsvOptions;
 use crate::io::log::{LogCounts, LogError, LogOptions, LogSource};
 use crate::io::socket::{PassiveSocket, explained};
 use crate::io::stop::Stop;
@@ -134,7 +135,8 @@ pub fn replay(
     interrupt: &Interrupt,
     each: &mut dyn FnMut(CheckProgress),
 ) -> Result<(WiringReport, LogCounts), LogError> {
-    let (cells, is_total) = (survey.plan.pack.cells, survey.plan.pack.is_total);
+    let pack = &survey.plan.pack;
+    let (cells, is_total) = (pack.cells, pack.is_total);
     let encoder = InputEncoder::new(&survey.input).with_answers(&survey.answers);
     let mut protector = InputProtector::new(&survey.plan.guards);
     let mut source = LogSource::new(
@@ -143,7 +145,13 @@ pub fn replay(
             interfaces: survey.plan.interfaces.iter().map(|interface| interface.name.clone()).collect(),
             channels: reading.channels.clone(),
             strict: reading.strict,
-            csv: reading.csv_options(if is_total { 1 } else { cells }, is_total),
+            csv: reading.csv_options(CsvOptions {
+                cells: if is_total { 1 } else { cells },
+                pack_total: is_total,
+                series: cells,
+                capacity_ah: Some(pack.capacity_ah * f64::from(pack.strings.max(1))),
+                ..CsvOptions::default()
+            }),
             encode_row: Box::new(move |values, frames| {
                 let uncarried = encoder.encode(values, frames);
                 protector.protect(frames);

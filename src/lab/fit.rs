@@ -43,6 +43,7 @@ use crate::ident::parameters::ParameterTables;
 use crate::ident::prior::PriorDeviations;
 use crate::ident::record::{self, Record};
 use crate::ident::{ageing, error_table, fit, thermal};
+use crate::io::csv_log::{CsvOptions, TableReading};
 
 /// Smallest share of the SOC range that the data must cover.
 const MIN_SOC_RANGE: f64 = 0.5;
@@ -131,6 +132,8 @@ pub struct FitOutcome {
     pub by_kind: Option<(Residual, Residual)>,
     /// Residuals of each file; slow tests come last.
     pub files: Vec<FileResidual>,
+    /// What was read of each file.
+    pub tables: Vec<TableReading>,
     /// The fitted records, in the order of the files; for plots.
     pub records: Vec<Record>,
     /// For each record, the index of its file in `files`.
@@ -175,6 +178,7 @@ pub fn run(request: &FitRequest, mut progress: impl FnMut(FitProgress)) -> Resul
     let voltage_error_v = error_table::table(&fitted, &judged(&records, &file_of_record), prepared.capacity_ah);
     let by_kind = request.first_cycles.map(|_| prepared.by_kind(&records, &fitted));
     let all: Vec<&MeasuredFile> = files.iter().chain(&slow).collect();
+    let tables = all.iter().map(|file| file.reading.clone()).collect();
     let files = by_file(&all, &prepared, &records, &fitted);
     // Without slow tests, the curve comes from discharges under load and is too coarse to identify electrodes.
     let has_curve = !prepared.ocv.is_empty() && request.ageing_shift.is_none();
@@ -188,6 +192,7 @@ pub fn run(request: &FitRequest, mut progress: impl FnMut(FitProgress)) -> Resul
         measured: MeasuredRange::of(&records),
         by_kind,
         files,
+        tables,
         records,
         file_of_record,
         logs: None,
@@ -235,11 +240,12 @@ fn read_all(
     request: &FitRequest,
     progress: &mut impl FnMut(FitProgress),
 ) -> Result<(Vec<MeasuredFile>, Vec<MeasuredFile>), LabError> {
+    let table = CsvOptions { capacity_ah: request.capacity_ah.or(request.rated_ah), ..request.table.clone() };
     let paths: Vec<&PathBuf> = request.files.iter().chain(&request.ocv).collect();
     let workers = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
     let mut read = Vec::with_capacity(paths.len());
     for some in paths.chunks(workers) {
-        let files: Result<Vec<_>, _> = some.par_iter().map(|path| MeasuredFile::read(path)).collect();
+        let files: Result<Vec<_>, _> = some.par_iter().map(|path| MeasuredFile::read(path, &table)).collect();
         read.extend(files?);
         progress(FitProgress::Read(read.len(), paths.len()));
     }

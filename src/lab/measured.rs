@@ -1,19 +1,16 @@
-//! Reads the files of a cycler: CSV (plain, gzip or zstd) with time, current, voltage, temperature and ampere-hours.
+//! Reads the files of a cycler with time, current, voltage, temperature and ampere-hours.
 //!
-//! Columns are found by name. Required are `time_s`, `current_a` (positive = discharge) and `voltage_v`. Optional are
-//! `temperature_c`, `discharged_ah` (positive = taken out), `type`, and a part column (`cycle`, `segment` or `ref`).
-//! The time restarts at each new value of the part column. An empty field becomes NaN, except the time. An empty time,
-//! or a field that is not a number, causes an error that names the line.
-//!
-//! Files in the Battery Data Format are recognised by their columns ([`BDF_COLUMNS`]). The signs of their current and
-//! charge are inverted.
+//! In: a table in a form that [`CsvLog`] reads, of one cell. Out: the parts of the file. The time restarts at each new
+//! value of the part column (`cycle`, `segment` or `ref`). The column `type` names the kind of a part. An empty field
+//! becomes NaN, except the time. An empty time, or a field that is not a number, causes an error that names the line.
 
 use std::path::{Path, PathBuf};
 
+use crate::can::decode::Channel;
 pub use crate::ident::MeasuredPart;
 pub use crate::io::csv_log::BDF_COLUMNS;
-use crate::io::csv_log::SampleColumns;
-use crate::io::table::{Header, Row, Table, TableError};
+use crate::io::csv_log::{CsvLog, CsvOptions, TableReading};
+use crate::io::table::TableError;
 
 /// One measured file.
 #[derive(Debug, Clone, PartialEq)]
@@ -24,38 +21,27 @@ pub struct MeasuredFile {
     pub parts: Vec<MeasuredPart>,
     /// Whether the file is in the Battery Data Format.
     pub is_bdf: bool,
-}
-
-/// Indices of the columns.
-struct Columns {
-    time: usize,
-    current: usize,
-    voltage: usize,
-    temperature: Option<usize>,
-    discharged: Option<usize>,
-    part: Option<usize>,
-    kind: Option<usize>,
-    /// Factor for current and charge: 1, or -1 if a positive current in the file charges the cell.
-    sign: f64,
+    /// What was read as what.
+    pub reading: TableReading,
 }
 
 impl MeasuredFile {
-    /// Reads a whole file.
+    /// Reads a whole file. `options` names columns and the sign of the current; the file has one cell.
     ///
     /// # Errors
-    /// The file cannot be read, a column is missing, a field is not a number, or the file has no rows. The error states
-    /// the place and what was found.
-    pub fn read(path: &Path) -> Result<Self, TableError> {
-        let mut table = Table::open(path)?;
-        let columns = Columns::find(table.header())?;
+    /// The file cannot be read, a column is missing, a field is not a number, values cannot be in their unit, or the
+    /// file has no rows. The error states the place and what was found.
+    pub fn read(path: &Path, options: &CsvOptions) -> Result<Self, TableError> {
+        let mut log = CsvLog::open_path(path, &CsvOptions { cells: 1, sensors: 1, series: 1, ..options.clone() })?;
         let mut parts: Vec<MeasuredPart> = Vec::new();
-        while let Some(row) = table.next_row()? {
-            columns.add_row(&row, &mut parts)?;
+        while let Some(row) = log.next_row()? {
+            // A division gives the number that the file states; `Timestamp::secs` may differ in the last bit.
+            add_row(row?.time.nanos() as f64 / 1e9, &log, &mut parts);
         }
         if parts.is_empty() {
-            return Err(table.header().file_fault("no rows after the header"));
+            return Err(log.header().file_fault("no rows after the header"));
         }
-        Ok(Self { path: path.to_owned(), parts, is_bdf: columns.sign < 0.0 })
+        Ok(Self { path: path.to_owned(), parts, is_bdf: log.is_bdf(), reading: log.reading().clone() })
     }
 
     /// Number of rows of all parts.
@@ -64,42 +50,24 @@ impl MeasuredFile {
     }
 }
 
-impl Columns {
-    fn find(header: &Header) -> Result<Self, TableError> {
-        let columns = SampleColumns::new(header, None);
-        Ok(Self {
-            time: columns.required("time", "time_s")?,
-            current: columns.required("current", "current_a")?,
-            voltage: columns.required("voltage", "voltage_v")?,
-            temperature: columns.optional("temperature", "temperature_c")?,
-            discharged: columns.optional("charge", "discharged_ah")?,
-            part: columns.part()?,
-            kind: header.find("type"),
-            sign: if columns.is_bdf { -1.0 } else { 1.0 },
-        })
+/// Adds the last row of `log` to the last part, or to a new part if the section of the row differs.
+fn add_row(time_s: f64, log: &CsvLog, parts: &mut Vec<MeasuredPart>) {
+    let [mut current_a, mut voltage_v, mut temperature_c] = [f64::NAN; 3];
+    for (channel, value) in &log.values {
+        let place = match channel {
+            Channel::Current => &mut current_a,
+            Channel::CellVoltage(_) => &mut voltage_v,
+            _ => &mut temperature_c,
+        };
+        *place = value.map_or(f64::NAN, |value| value + 0.0);
     }
-
-    /// Converts the sign; the result is never -0.
-    fn signed(&self, value: f64) -> f64 {
-        self.sign * value + 0.0
+    let key = String::from_utf8_lossy(log.section());
+    if parts.last().is_none_or(|part| part.key != key) {
+        let kind = String::from_utf8_lossy(&log.kind_text).into_owned();
+        parts.push(MeasuredPart { key: key.into_owned(), kind, ..MeasuredPart::default() });
     }
-
-    /// Adds a row to the last part, or to a new part if the key of the row differs.
-    fn add_row(&self, row: &Row<'_>, parts: &mut Vec<MeasuredPart>) -> Result<(), TableError> {
-        let text = |column: Option<usize>| column.map_or_else(Default::default, |column| row.text(column));
-        let number = |column: usize| Ok(row.number(column)?.unwrap_or(f64::NAN));
-        let optional = |column: Option<usize>| column.map_or(Ok(f64::NAN), number);
-        let time_s = row.number(self.time)?.ok_or_else(|| row.fault(self.time, "seconds"))?;
-        let (current_a, voltage_v) = (self.signed(number(self.current)?), number(self.voltage)?);
-        let (temperature_c, discharged_ah) = (optional(self.temperature)?, self.signed(optional(self.discharged)?));
-        let key = text(self.part);
-        if parts.last().is_none_or(|part| part.key != key) {
-            let kind = text(self.kind).into_owned();
-            parts.push(MeasuredPart { key: key.into_owned(), kind, ..MeasuredPart::default() });
-        }
-        let Some(part) = parts.last_mut() else { return Ok(()) };
-        part.push(time_s, current_a, voltage_v, temperature_c, discharged_ah);
-        Ok(())
+    if let Some(part) = parts.last_mut() {
+        part.push(time_s, current_a, voltage_v, temperature_c, log.discharged_ah);
     }
 }
 
@@ -111,7 +79,8 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("cell.csv");
         std::fs::write(&path, text).expect("written");
-        MeasuredFile::read(&path).map_err(|e| e.to_string().replace(&format!("{}/", folder.path().display()), ""))
+        MeasuredFile::read(&path, &CsvOptions::default())
+            .map_err(|e| e.to_string().replace(&format!("{}/", folder.path().display()), ""))
     }
 
     #[test]

@@ -38,6 +38,7 @@ pub use soc::{CONVERGED_HOLD_S, CONVERGED_POINTS, SocScore};
 
 use super::measured::MeasuredFile;
 use crate::error::LabError;
+use crate::io::csv_log::CsvOptions;
 use crate::monitor::MonitorConfig;
 
 /// Settings of all files and cases.
@@ -57,6 +58,8 @@ pub struct ScoreSettings {
     pub soc_std: Option<f64>,
     /// Standard deviation of the initial capacity, as a fraction of the model's capacity; `None` = as configured.
     pub capacity_std: Option<f64>,
+    /// Columns and sign of the files, if their headers do not say it.
+    pub table: CsvOptions,
     /// If a gap between two rows is longer than this (s), the recorder counts as asleep.
     pub sleep_gap_s: f64,
     /// Capacity threshold (Ah); the first discharge below it is reported.
@@ -117,7 +120,7 @@ fn score_file(
     settings: &ScoreSettings,
     progress: &dyn Fn(f64),
 ) -> Result<Vec<CaseScore>, LabError> {
-    let file = MeasuredFile::read(&job.path)?;
+    let file = MeasuredFile::read(&job.path, &settings.table)?;
     let share = 1.0 / cases.len().max(1) as f64;
     cases.iter().map(|case| case::run(job, &file, case, settings, &|part| progress(part * share))).collect()
 }

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use arrow_array::{ArrayRef, StringArray};
+use packwatch_host::io::csv_log::CsvOptions;
 use packwatch_lab::measured::{MeasuredFile, MeasuredPart};
 use pyo3::prelude::*;
 
@@ -18,7 +19,7 @@ pub(crate) fn read(py: Python<'_>, path: PathBuf, bdf_positive: &str) -> PyResul
     if !["charge", "discharge"].contains(&bdf_positive) {
         return Err(data(format!("bdf_positive {bdf_positive:?}, must be charge or discharge")));
     }
-    let file = py.detach(|| MeasuredFile::read(&path)).map_err(of_library)?;
+    let file = py.detach(|| MeasuredFile::read(&path, &CsvOptions::default())).map_err(of_library)?;
     let sign = if file.is_bdf && bdf_positive == "discharge" { -1.0 } else { 1.0 };
     let column = |of: fn(&MeasuredPart) -> &Vec<f64>, sign: f64| {
         reals(file.parts.iter().flat_map(|part| of(part).iter().map(|value| sign * value + 0.0)).collect())

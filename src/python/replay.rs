@@ -62,7 +62,7 @@ impl Replay {
 
 /// Replays logs as one continuous recording.
 #[pyfunction]
-#[pyo3(signature = (config, logs, *, columns=None, csv_sign="discharge", start_times=None, strict=false, sleep_gap_s=30.0,
+#[pyo3(signature = (config, logs, *, columns=None, csv_sign=None, start_times=None, strict=false, sleep_gap_s=30.0,
                     estimates_period_s=0.0, progress=false))]
 #[expect(clippy::too_many_arguments, reason = "keyword arguments of Python")]
 pub(crate) fn replay(
@@ -70,7 +70,7 @@ pub(crate) fn replay(
     config: PathBuf,
     logs: List<PathBuf>,
     columns: Option<std::collections::BTreeMap<String, String>>,
-    csv_sign: &str,
+    csv_sign: Option<&str>,
     start_times: Option<PathBuf>,
     strict: bool,
     sleep_gap_s: f64,
@@ -78,9 +78,10 @@ pub(crate) fn replay(
     progress: bool,
 ) -> PyResult<Replay> {
     let charge_positive = match csv_sign {
-        "discharge" => false,
-        "charge" => true,
-        other => return Err(data(format!("csv_sign {other:?}, must be discharge or charge"))),
+        None => None,
+        Some("discharge") => Some(false),
+        Some("charge") => Some(true),
+        Some(other) => return Err(data(format!("csv_sign {other:?}, must be discharge or charge"))),
     };
     if sleep_gap_s.is_nan() || sleep_gap_s <= 0.0 {
         return Err(data(format!("sleep_gap_s = {sleep_gap_s}, must be above 0")));

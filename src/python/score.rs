@@ -96,6 +96,7 @@ pub(crate) fn score(
         current_offset_a: current_offset_a.map_or(usual.current_offset_a, |ampere| ampere.0),
         settle_s: settle_s.unwrap_or(usual.settle_s),
         truth_capacity_ah,
+        table: usual.table,
         sleep_gap_s: sleep_gap_s.unwrap_or(usual.sleep_gap_s),
         cycles: cycles.map_or_else(Vec::new, |tables| tables.0),
         load,

@@ -451,7 +451,7 @@ fn csv_rows_become_frames_bad_fields_are_named() {
         other => panic!("{other:?}"),
     };
     assert_eq!((data(&records[0]), data(&records[1])), (vec![15, 40], vec![0xFF, 39]));
-    let (flipped, _) = read(&[path], false, |o| o.csv.charge_positive = true).expect("read");
+    let (flipped, _) = read(&[path], false, |o| o.csv.charge_positive = Some(true)).expect("read");
     assert_eq!(data(&flipped[0])[0] as i8, -15);
 }
 

@@ -50,6 +50,7 @@ mod layering;
 mod life_decodes;
 mod log_grammar;
 mod measured_life;
+mod mistakes;
 mod model_cli;
 mod monitor_alarms;
 mod monitor_cuts;
@@ -81,6 +82,7 @@ mod score_cli;
 mod simulate_cli;
 mod store_cli;
 mod support;
+mod tables;
 mod tuned_constants;
 mod uplink_cli;
 #[cfg(feature = "lab")]

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use super::numbers::positive;
 use crate::config::Config;
+use crate::io::csv_log::{CsvOptions, TableReading};
 use crate::io::log::LogOptions;
 use crate::replay::{LogReading, SLEEP_GAP_S};
 
@@ -29,14 +30,15 @@ pub(crate) struct InputArgs {
     /// default, numbered channels are the configured interfaces in their order
     #[arg(long = "channel", value_name = "CHANNEL=INTERFACE", value_parser = channel)]
     pub(crate) channels: Vec<(String, String)>,
-    /// Name a CSV column, for example current=Current(A). ROLE is time, current, voltage, temperature or section. If
+    /// Name a CSV column, for example current=Current(A). ROLE is time, current, voltage, temperature, state or section. If
+    /// the header has no unit or a wrong one, write the unit after the name: 'current=I[mA]'. If
     /// each cell or sensor has its own column (U1, U2, ..., counted from 1), write the letter n in braces in place of
     /// the number in NAME, and at the end of ROLE. An empty NAME means that the column does not exist
     #[arg(long = "column", value_name = "ROLE=NAME", value_parser = column)]
     pub(crate) columns: Vec<(String, String)>,
-    /// Direction of positive current in a CSV
-    #[arg(long, value_enum, default_value = "discharge")]
-    pub(crate) csv_sign: CsvSign,
+    /// Direction of positive current in a CSV [default: as the format counts, else as the state column or the voltage shows]
+    #[arg(long, value_enum)]
+    pub(crate) csv_sign: Option<CsvSign>,
     /// CSV table that gives the start time of each section of a CSV log. The table has two columns: the log's section
     /// column, for example `cycle`, and `start`
     #[arg(long, value_name = "TABLE.csv")]
@@ -50,7 +52,7 @@ impl Default for InputArgs {
             sleep_gap: SLEEP_GAP_S,
             channels: Vec::new(),
             columns: Vec::new(),
-            csv_sign: CsvSign::Discharge,
+            csv_sign: None,
             start_times: None,
         }
     }
@@ -62,7 +64,7 @@ pub(crate) fn log_options(args: &InputArgs, config: &Config) -> LogOptions {
         strict: args.strict,
         channels: args.channels.clone(),
         columns: args.columns.clone(),
-        charge_positive: args.csv_sign == CsvSign::Charge,
+        charge_positive: charge_positive(args.csv_sign),
         start_times: args.start_times.clone(),
     };
     reading.options(config)
@@ -77,8 +79,25 @@ pub(crate) fn channel(text: &str) -> Result<(String, String), String> {
     }
 }
 
+/// Whether a positive current is a charge; `None` = the file decides.
+pub(crate) fn charge_positive(sign: Option<CsvSign>) -> Option<bool> {
+    sign.map(|sign| sign == CsvSign::Charge)
+}
+
+/// Columns and sign of the measured files of one cell.
+pub(crate) fn table_options(args: &InputArgs) -> CsvOptions {
+    let charge_positive = charge_positive(args.csv_sign);
+    CsvOptions { columns: args.columns.clone(), charge_positive, ..CsvOptions::default() }
+}
+
+/// Prints what was read of each table, one line per table.
+pub(crate) fn print_tables(tables: &[TableReading]) {
+    tables.iter().for_each(|table| eprintln!("{table}"));
+}
+
 pub(crate) fn column(text: &str) -> Result<(String, String), String> {
-    const ROLES: [&str; 7] = ["time", "current", "voltage", "voltage{n}", "temperature", "temperature{n}", "section"];
+    const ROLES: [&str; 8] =
+        ["time", "current", "voltage", "voltage{n}", "temperature", "temperature{n}", "state", "section"];
     let (role, name) = text.split_once('=').ok_or("must be ROLE=NAME, for example current=Current(A)")?;
     if !ROLES.contains(&role) {
         return Err(format!("unknown role {role:?}, must be one of {}", ROLES.join(", ")));

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use packwatch_host::failure::Failure;
 
-use super::logs::{InputArgs, log_options};
+use super::logs::{InputArgs, log_options, print_tables};
 use super::output::failure;
 use super::progress::Bar;
 use crate::config::Config;
@@ -30,6 +30,7 @@ pub(crate) fn replay(logs: &[PathBuf], input: &InputArgs, config: &Config, sinks
     let monitor = Monitor::new(config.monitor.clone());
     let result = replay::run(&mut source, monitor, sinks, settings, &mut |progress| bar.show(progress));
     bar.clear();
+    print_tables(&source.counts().tables);
     let (summary, snapshot) = result.map_err(failure)?;
     if let Some(reason) = &summary.failure {
         return Err(Failure::new(reason));

@@ -14,6 +14,7 @@ use super::args::Args;
 use super::report;
 use packwatch_host::failure::Failure;
 
+use crate::cli::common::logs::print_tables;
 use crate::cli::common::output::{check_distinct, create_folder, failure};
 use crate::cli::common::progress::bar;
 use crate::config::Config;
@@ -126,6 +127,9 @@ fn named(log: &Path, error: &ReplayError) -> String {
 }
 
 fn print(args: &Args, log: &Path, result: &Result<ReplaySummary, ReplayError>) -> io::Result<()> {
+    if let Ok(summary) = result {
+        print_tables(&summary.log.tables);
+    }
     let mut out = io::stdout().lock();
     match result {
         Ok(summary) if args.json => report::json_line(&mut out, log, summary),

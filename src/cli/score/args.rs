@@ -3,7 +3,9 @@
 use std::path::PathBuf;
 
 use crate::cli::common::label::LabelArgs;
+use crate::cli::common::logs::{CsvSign, charge_positive, column};
 use crate::cli::common::numbers::{NamedValue, above_0, above_0_to, finite, fraction, integer, one_of, within};
+use crate::io::csv_log::CsvOptions;
 use crate::lab::score::{ScoreRequest, Start};
 use crate::lab::single_cell::CellSource;
 
@@ -41,6 +43,12 @@ pub(crate) struct Args {
     /// there
     #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with = "cycles")]
     pub(crate) learn: Vec<PathBuf>,
+    /// Name a column, as for `replay`
+    #[arg(long = "column", value_name = "ROLE=NAME", value_parser = column)]
+    pub(crate) columns: Vec<(String, String)>,
+    /// Direction of positive current, as for `replay`
+    #[arg(long, value_enum)]
+    pub(crate) csv_sign: Option<CsvSign>,
     #[command(flatten)]
     pub(crate) label: LabelArgs,
     #[command(flatten)]
@@ -140,11 +148,13 @@ pub(crate) struct OutputArgs {
 impl Args {
     /// Converts the arguments to a request.
     pub(super) fn request(&self) -> ScoreRequest {
-        let Self { files, config, cell, label, learn, starts, statistics, life, output } = self;
+        let Self { files, config, cell, learn, columns, csv_sign, label, starts, statistics, life, output } = self;
+        let charge_positive = charge_positive(*csv_sign);
         ScoreRequest {
             files: files.clone(),
             source: CellSource { config: config.clone(), cell: cell.clone(), label: label.keys() },
             learn: learn.clone(),
+            table: CsvOptions { columns: columns.clone(), charge_positive, ..CsvOptions::default() },
             start: starts.start.clone(),
             remove: starts.remove,
             soc_error_points: starts.soc_error.iter().map(|error| error.0).collect(),

@@ -1,34 +1,59 @@
-//! Reads CSV logs: one row per sample, columns found by name, values in packwatch's units.
+//! Reads tables of samples: the exports of cyclers, applications and battery management systems, and packwatch's own
+//! CSV. All commands read tables with this reader.
 //!
-//! Files in the Battery Data Format are recognised by the columns of that format ([`BDF_COLUMNS`]). A positive current
-//! is a discharge, except with [`CsvOptions::charge_positive`] and in the Battery Data Format. An empty field means "no
-//! reading". A row is bad if a field is missing or is not a finite number. A section column (`cycle`, `segment`, `ref`,
-//! or the column that the user names) divides a file into sections; time restarts in each section. If a table states
-//! the start times of the sections, the stamps are absolute. Otherwise, the gaps between the sections are unknown.
+//! In: a table and the options. Out: rows of values in packwatch's units; a positive current is a discharge. The
+//! columns are found by name in a [dictionary](dictionary), or the user names them. Units are in the header, in a
+//! second header row, or after the name that the user gives. The first rows decide the rest: [judge] finds the sign of
+//! the current and units that the header does not state, and rejects values that cannot be in the stated unit. An
+//! empty field means "no reading". A row is bad if a field is missing or is not a finite number. A section column
+//! (`cycle`, `segment`, `ref`, or the column that the user names) divides a file into sections; time restarts in each
+//! section. If a table states the start times of the sections, the stamps are absolute. Otherwise, the gaps between the
+//! sections are unknown. [`TableReading`] says what was read as what.
 
 use std::collections::HashMap;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-use super::stamp;
-use super::table::{self, Header, PART_COLUMNS, Quotes, Row, Table, TableError};
-use crate::can::decode::{Channel, SensorIndex};
-use crate::quantity::{CellIndex, Timestamp};
+mod column_name;
+mod dictionary;
+mod judge;
+mod layout;
+mod reading;
+mod time_text;
 
-/// Options for reading CSV files.
-#[derive(Debug, Clone, Default)]
+use super::plausible::PackSize;
+use super::table::{Header, Quotes, Row, Table, TableError};
+use crate::can::decode::Channel;
+use crate::quantity::Timestamp;
+pub use dictionary::BDF_COLUMNS;
+use judge::{CurrentSign, Judgement, direction};
+use layout::{Column, Layout};
+pub use reading::TableReading;
+use time_text::TimeText;
+
+/// Options for reading tables of samples.
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct CsvOptions {
-    /// Maps a role to a column: `time`, `current`, `voltage`, `temperature`, `section`. If role and column contain
-    /// `{n}`, there is one column per cell or sensor, counted from 1.
+    /// Maps a role to a column: `time`, `current`, `voltage`, `temperature`, `state`, `section`. If role and column
+    /// contain `{n}`, there is one column per cell or sensor, counted from 1. A unit in brackets may follow the name.
     pub columns: Vec<(String, String)>,
-    /// Whether the file counts a charging current as positive.
-    pub charge_positive: bool,
+    /// Whether the file counts a charging current as positive; `None` = the format, the state column or the voltage
+    /// decides.
+    pub charge_positive: Option<bool>,
     /// Table with the absolute start time of each section.
     pub start_times: Option<PathBuf>,
     /// Number of cells in the configuration.
     pub cells: u16,
+    /// Number of cells in series, by which a total voltage is divided to judge it.
+    pub series: u16,
+    /// Number of temperature sensors in the configuration.
+    pub sensors: u16,
     /// Whether the voltage is the pack's total.
     pub pack_total: bool,
+    /// Whether the configuration has an input for the SOC that the pack reports.
+    pub reported_soc: bool,
+    /// Capacity of the pack (Ah), to judge currents; `None` = unknown.
+    pub capacity_ah: Option<f64>,
 }
 
 /// Time of a row, and whether an unknown gap precedes the row.
@@ -42,16 +67,27 @@ pub struct RowTime {
     pub after_unknown_gap: bool,
 }
 
-/// A CSV file being read.
+/// A table of samples being read.
 pub struct CsvLog {
     table: Table,
     time_column: usize,
-    /// The channel of each used column.
-    channels: Vec<(Channel, usize)>,
-    charge_positive: bool,
+    time: TimeText,
+    /// The column of each used channel.
+    channels: Vec<(Channel, Column)>,
+    sign: CurrentSign,
+    max_current_a: f64,
+    state: Option<usize>,
+    discharged: Option<(Column, f64)>,
     sections: Option<Sections>,
+    kind: Option<usize>,
+    is_bdf: bool,
+    reading: TableReading,
     /// Values of the last row.
     pub values: Vec<(Channel, Option<f64>)>,
+    /// Charge taken out until the last row (Ah); NaN = not in the table.
+    pub discharged_ah: f64,
+    /// Kind of the last row: the column `type`.
+    pub kind_text: Vec<u8>,
 }
 
 /// The section column and the current section.
@@ -63,19 +99,93 @@ struct Sections {
     start: Option<Timestamp>,
 }
 
+/// Whether a log is a table of samples by its name.
+pub fn has_table_name(path: &Path) -> bool {
+    const ENDINGS: [&str; 7] = [".csv", ".tsv", ".mpt", ".bdf", ".parquet", ".pq", ".parq"];
+    let name = path.file_name().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
+    let name = name.trim_end_matches(".gz").trim_end_matches(".zst");
+    ENDINGS.iter().any(|ending| name.ends_with(ending))
+}
+
+/// Whether a log is a table of samples, by its name or by its first bytes.
+pub(super) fn is_table(path: &Path, head: &[u8]) -> bool {
+    let first_line = head.split(|&byte| byte == b'\n').next().unwrap_or_default();
+    let is_utf16 = head.starts_with(&[0xFF, 0xFE]) || head.starts_with(&[0xFE, 0xFF]);
+    has_table_name(path)
+        || (!first_line.starts_with(b"(")
+            && (is_parquet(head)
+                || is_utf16
+                || first_line.contains(&b',')
+                || super::table::has_header(head, &dictionary::score)))
+}
+
+fn is_parquet(head: &[u8]) -> bool {
+    head.starts_with(b"PAR1")
+}
+
 impl CsvLog {
-    /// Reads the header line and finds the columns. `name` is the file name for messages.
+    /// Reads a whole file: text, uncompressed or as gzip or zstd, or Parquet.
     ///
     /// # Errors
-    /// Fails if the source cannot be read, a column is missing, or the table of start times is faulty.
-    pub fn open(source: Box<dyn Read>, name: &str, options: &CsvOptions) -> Result<Self, TableError> {
-        let table = Table::new(source, name.to_owned(), Quotes::Literal)?;
-        let columns = Columns { named: SampleColumns::new(table.header(), Some(&options.columns)), options };
-        let time_column = columns.named.required("time", "time_s")?;
-        let (sections, channels) = (columns.sections()?, columns.channels()?);
-        let charge_positive = options.charge_positive || columns.named.is_bdf;
-        let values = Vec::with_capacity(channels.len());
-        Ok(Self { table, time_column, channels, charge_positive, sections, values })
+    /// Like [`open`](Self::open).
+    pub fn open_path(path: &Path, options: &CsvOptions) -> Result<Self, TableError> {
+        let file = path.display();
+        let source = super::lines::open(path, &std::sync::Arc::default());
+        let source = source.map_err(|error| TableError::of_io(format!("{file}: cannot be read: {error}"), &error))?;
+        let mut lines = super::lines::Lines::new(source);
+        lines.peek().map_err(|error| TableError::of_io(format!("{file}: damaged: {error}"), &error)).map(|_| ())?;
+        Self::open(Box::new(lines.into_reader()), path, options)
+    }
+
+    /// Reads the header and the first rows. `path` names the file in messages; a Parquet file is read from there.
+    ///
+    /// # Errors
+    /// Fails if the source cannot be read, a column is missing, values cannot be in the unit that the header states, or
+    /// the table of start times is faulty.
+    pub fn open(source: Box<dyn Read>, path: &Path, options: &CsvOptions) -> Result<Self, TableError> {
+        let (table, mut preview) = open_table(source, path, options)?;
+        let mut layout = Layout::find(table.header(), options)?;
+        let judgement = judge::judge(&mut preview, &mut layout, options)?;
+        let sections = sections(table.header(), layout.section, options)?;
+        let reading = TableReading::new(table.header(), &layout, &judgement, options);
+        let Judgement { time, sign, .. } = judgement;
+        Ok(Self {
+            time_column: layout.time.index,
+            time,
+            values: Vec::with_capacity(layout.channels.len()),
+            channels: layout.channels,
+            sign,
+            max_current_a: PackSize { capacity_ah: options.capacity_ah }.max_current_a(),
+            state: layout.state,
+            discharged: layout.discharged,
+            sections,
+            kind: table.header().find("type"),
+            is_bdf: layout.format == dictionary::Format::BatteryDataFormat,
+            reading,
+            table,
+            discharged_ah: f64::NAN,
+            kind_text: Vec::new(),
+        })
+    }
+
+    /// Name of the file and its columns.
+    pub fn header(&self) -> &Header {
+        self.table.header()
+    }
+
+    /// Whether the file is in the Battery Data Format.
+    pub fn is_bdf(&self) -> bool {
+        self.is_bdf
+    }
+
+    /// What was read as what, and how many rows until now.
+    pub fn reading(&self) -> &TableReading {
+        &self.reading
+    }
+
+    /// The section of the last row; empty without a section column.
+    pub fn section(&self) -> &[u8] {
+        self.sections.as_ref().and_then(|sections| sections.current.as_deref()).unwrap_or_default()
     }
 
     /// Reads one row into [`values`](Self::values). Returns `None` at the end of the file, and an inner error if the
@@ -86,22 +196,78 @@ impl CsvLog {
     pub fn next_row(&mut self) -> Result<Option<Result<RowTime, TableError>>, TableError> {
         let Some(row) = self.table.next_row()? else { return Ok(None) };
         self.values.clear();
-        let time_text = row.bytes(self.time_column).unwrap_or_default();
-        let Some(time) = stamp::parse_seconds(time_text) else {
-            return Ok(Some(Err(row.fault(self.time_column, "seconds as a finite number"))));
+        self.reading.rows += 1;
+        let Some(time) = self.time.parse(row.bytes(self.time_column).unwrap_or_default()) else {
+            return Ok(Some(Err(row.fault(self.time_column, "a time"))));
         };
         for &(channel, column) in &self.channels {
-            let Some(value) = row.bytes(column).and_then(table::parse_field) else {
-                return Ok(Some(Err(row.fault(column, "a finite number or an empty field"))));
+            let Some(value) = row.bytes(column.index).and_then(|_| row.parsed(column.index)) else {
+                return Ok(Some(Err(row.fault(column.index, "a finite number or an empty field"))));
             };
-            let flip = channel == Channel::Current && self.charge_positive;
-            self.values.push((channel, if flip { value.map(|v| -v) } else { value }));
+            let value = value.map(|value| column.unit.convert(value));
+            let value = if channel == Channel::Current {
+                value.and_then(|v| self.reading.check(signed(&mut self.sign, v, &row, self.state), self.max_current_a))
+            } else {
+                value
+            };
+            self.values.push((channel, value));
         }
+        self.discharged_ah = f64::NAN;
+        if let Some((column, factor)) = &self.discharged {
+            let Some(value) = row.parsed(column.index) else {
+                return Ok(Some(Err(row.fault(column.index, "a finite number or an empty field"))));
+            };
+            self.discharged_ah = value.map_or(f64::NAN, |value| factor * column.unit.convert(value) + 0.0);
+        }
+        if let Some(kind) = self.kind {
+            self.kind_text.clear();
+            self.kind_text.extend_from_slice(row.bytes(kind).unwrap_or_default());
+        }
+        self.reading.read += 1;
         let Some(sections) = &mut self.sections else {
             return Ok(Some(Ok(RowTime { line: row.line, time, after_unknown_gap: false })));
         };
         Ok(Some(sections.place(&row, time)))
     }
+}
+
+/// The current with positive = discharge; `None` if it contradicts the state column.
+fn signed(sign: &mut CurrentSign, value: f64, row: &Row<'_>, state: Option<usize>) -> Option<f64> {
+    let state = state.filter(|_| sign.is_by_state).and_then(|column| row.bytes(column));
+    sign.discharge(value, state.and_then(direction))
+}
+
+/// Opens a table, and a second one for a look at the first rows.
+fn open_table(source: Box<dyn Read>, path: &Path, options: &CsvOptions) -> Result<(Table, Table), TableError> {
+    let mut magic = Vec::with_capacity(4);
+    let mut source = source;
+    let file = path.display().to_string();
+    let read = source.by_ref().take(4).read_to_end(&mut magic);
+    read.map_err(|error| TableError::of_io(format!("{file}: cannot be read: {error}"), &error))?;
+    if is_parquet(&magic) {
+        return open_parquet(path);
+    }
+    let whole = Box::new(std::io::Cursor::new(magic).chain(source));
+    let bare = |name: &str| name.rsplit_once('[').map_or(name, |of| of.0).trim().to_owned();
+    let named: Vec<(&str, String)> = options.columns.iter().map(|(_, name)| (name.as_str(), bare(name))).collect();
+    let score = |fields: &[String]| {
+        let is_named =
+            |field: &String| named.iter().any(|(name, bare)| field == name || (!bare.is_empty() && field == bare));
+        let count = fields.iter().filter(|field| is_named(field)).count();
+        count + dictionary::score(fields)
+    };
+    Table::find(whole, file, Quotes::Literal, &score)
+}
+
+#[cfg(feature = "formats")]
+fn open_parquet(path: &Path) -> Result<(Table, Table), TableError> {
+    Table::open_parquet(path)
+}
+
+#[cfg(not(feature = "formats"))]
+fn open_parquet(path: &Path) -> Result<(Table, Table), TableError> {
+    let file = path.display();
+    Err(TableError::Data(format!("{file}: is a Parquet file, which this program does not read; convert it to CSV")))
 }
 
 impl Sections {
@@ -120,161 +286,20 @@ impl Sections {
     }
 }
 
-/// Columns of the Battery Data Format: packwatch's name, the format's label, and the format's machine-readable name.
-/// The first name that exists in the file is used.
-pub const BDF_COLUMNS: [(&str, &str, &str); 6] = [
-    ("time_s", "Test Time / s", "test_time_second"),
-    ("current_a", "Current / A", "current_ampere"),
-    ("voltage_v", "Voltage / V", "voltage_volt"),
-    ("temperature_c", "Surface Temperature T1 / degC", "temperature_t1_celsius"),
-    ("temperature_c", "Ambient Temperature / degC", "ambient_temperature_celsius"),
-    // The sign of this column is opposite to packwatch's, like the sign of the current.
-    ("discharged_ah", "Net Capacity / Ah", "net_capacity_ah"),
-];
-
-/// Finds the columns of samples. A column has the name that the user maps, else packwatch's name or the name in the
-/// Battery Data Format.
-pub struct SampleColumns<'a> {
-    header: &'a Header,
-    /// Maps a role to a column; `None` = the user cannot map columns.
-    mapping: Option<&'a [(String, String)]>,
-    /// Whether the file is in the Battery Data Format. A positive current in this format is a charge. The format does
-    /// not state the sign, but net capacity in this format is charged minus discharged capacity, and cyclers use this
-    /// sign.
-    pub is_bdf: bool,
-}
-
-impl<'a> SampleColumns<'a> {
-    /// Columns of a header line.
-    pub fn new(header: &'a Header, mapping: Option<&'a [(String, String)]>) -> Self {
-        let is_bdf = header.find("time_s").is_none() && header.find_any(&bdf_names("time_s")).is_some();
-        Self { header, mapping, is_bdf }
-    }
-
-    fn mapped(&self, role: &str) -> Option<&'a str> {
-        self.mapping?.iter().rev().find(|(r, _)| r == role).map(|(_, column)| column.as_str())
-    }
-
-    fn usual(&self, ours: &'a str) -> Vec<&'a str> {
-        if self.is_bdf { bdf_names(ours) } else { vec![ours] }
-    }
-
-    fn find(&self, role: &str, names: &[&str]) -> Result<usize, TableError> {
-        let missing = || {
-            let (name, found) = (names.join(" or "), self.header.names().join(","));
-            let (of, hint) = match self.mapping {
-                Some(_) => (format!(" for {role}"), format!(" (map it with --column {role}=NAME)")),
-                None => Default::default(),
-            };
-            self.header.fault(format_args!("no column {name}{of}, found {found}{hint}"))
-        };
-        self.header.find_any(names).ok_or_else(missing)
-    }
-
-    /// Index of the column of a role. If the user maps no column, the column has packwatch's name `ours` or, in the
-    /// Battery Data Format, the format's name.
-    ///
-    /// # Errors
-    /// Fails if the file does not have this column.
-    pub fn required(&self, role: &str, ours: &'a str) -> Result<usize, TableError> {
-        self.find(role, &self.mapped(role).map_or_else(|| self.usual(ours), |column| vec![column]))
-    }
-
-    /// Index of the column of a role. If the user maps no column, the column has packwatch's name `ours` or, in the
-    /// Battery Data Format, the format's name. `None` = the file does not have this column.
-    ///
-    /// # Errors
-    /// Fails if the file does not have the column that the user maps.
-    pub fn optional(&self, role: &str, ours: &'a str) -> Result<Option<usize>, TableError> {
-        match self.mapped(role) {
-            Some(column) => self.find(role, &[column]).map(Some),
-            None => Ok(self.header.find_any(&self.usual(ours))),
+/// The section column, with the starts of the sections.
+fn sections(header: &Header, column: Option<usize>, options: &CsvOptions) -> Result<Option<Sections>, TableError> {
+    let starts = match (&options.start_times, column) {
+        (Some(path), Some(column)) => Some(read_starts(path, &header.names()[column])?),
+        (Some(path), None) => {
+            return Err(header.fault(format_args!(
+                "no section column (cycle, segment or ref), which --start-times {} needs; name it with --column \
+                 section=NAME",
+                path.display()
+            )));
         }
-    }
-
-    /// Index of the section column. Time restarts at each new value of this column.
-    ///
-    /// # Errors
-    /// Fails if the file does not have the column that the user maps.
-    pub fn part(&self) -> Result<Option<usize>, TableError> {
-        match self.mapped("section") {
-            Some("") => Ok(None),
-            Some(column) => self.find("section", &[column]).map(Some),
-            None => Ok(self.header.find_any(&PART_COLUMNS)),
-        }
-    }
-}
-
-/// Returns the names that the Battery Data Format uses for packwatch's column `ours`.
-fn bdf_names(ours: &str) -> Vec<&'static str> {
-    BDF_COLUMNS.iter().filter(|of| of.0 == ours).flat_map(|of| [of.1, of.2]).collect()
-}
-
-/// The columns of a log, according to its options.
-struct Columns<'a> {
-    named: SampleColumns<'a>,
-    options: &'a CsvOptions,
-}
-
-impl Columns<'_> {
-    fn sections(&self) -> Result<Option<Sections>, TableError> {
-        let (column, header) = (self.named.part()?, self.named.header);
-        let starts = match (&self.options.start_times, column) {
-            (Some(path), Some(column)) => Some(read_starts(path, &header.names()[column])?),
-            (Some(path), None) => {
-                return Err(header.fault(format_args!(
-                    "no section column (cycle, segment or ref), which --start-times {} needs; name it with --column \
-                     section=NAME",
-                    path.display()
-                )));
-            }
-            (None, _) => None,
-        };
-        Ok(column.map(|column| Sections { column, starts, current: None, start: None }))
-    }
-
-    fn channels(&self) -> Result<Vec<(Channel, usize)>, TableError> {
-        let mut channels = vec![(Channel::Current, self.named.required("current", "current_a")?)];
-        self.temperatures(&mut channels)?;
-        self.voltages(&mut channels)?;
-        channels.sort_by_key(|&(channel, _)| channel);
-        Ok(channels)
-    }
-
-    /// Finds the temperature columns, which are optional: one column for the first sensor, or a pattern for all sensors
-    /// of the file.
-    fn temperatures(&self, channels: &mut Vec<(Channel, usize)>) -> Result<(), TableError> {
-        if let Some(pattern) = self.named.mapped("temperature{n}") {
-            self.named.find("temperature{n}", &[&numbered(pattern, 0)])?;
-            let found = (0..u16::MAX).map_while(|n| Some((n, self.named.header.find(&numbered(pattern, n))?)));
-            channels.extend(found.map(|(n, column)| (Channel::Temperature(SensorIndex(n)), column)));
-            return Ok(());
-        }
-        let column = self.named.optional("temperature", "temperature_c")?;
-        channels.extend(column.map(|c| (Channel::Temperature(SensorIndex(0)), c)));
-        Ok(())
-    }
-
-    fn voltages(&self, channels: &mut Vec<(Channel, usize)>) -> Result<(), TableError> {
-        let cells = self.options.cells;
-        let pattern = self.named.mapped("voltage{n}");
-        if self.options.pack_total {
-            channels.push((Channel::PackVoltage, self.named.required("voltage", "voltage_v")?));
-        } else if cells == 1 && pattern.is_none() {
-            channels.push((Channel::CellVoltage(CellIndex(0)), self.named.required("voltage", "voltage_v")?));
-        } else {
-            let pattern = pattern.unwrap_or("voltage{n}_v");
-            for n in 0..cells {
-                let column = self.named.find("voltage{n}", &[&numbered(pattern, n)])?;
-                channels.push((Channel::CellVoltage(CellIndex(n)), column));
-            }
-        }
-        Ok(())
-    }
-}
-
-fn numbered(pattern: &str, index: u16) -> String {
-    pattern.replace("{n}", &(u32::from(index) + 1).to_string())
+        (None, _) => None,
+    };
+    Ok(column.map(|column| Sections { column, starts, current: None, start: None }))
 }
 
 /// Reads the start of each section from a table with two columns: the section column, and `start` (ISO 8601 or
@@ -290,16 +315,4 @@ fn read_starts(path: &Path, section: &str) -> Result<HashMap<Vec<u8>, Timestamp>
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn battery_data_format_current_changes_sign() {
-        let text = "Test Time / s,Voltage / V,Current / A\n0,3.5,-2\n";
-        let options = CsvOptions { cells: 1, ..CsvOptions::default() };
-        let mut log = CsvLog::open(Box::new(text.as_bytes()), "cell.csv", &options).expect("opens");
-        assert!(matches!(log.next_row(), Ok(Some(Ok(_)))));
-        let expected = [(Channel::Current, Some(2.0)), (Channel::CellVoltage(CellIndex(0)), Some(3.5))];
-        assert!(log.values.len() == 2 && expected.iter().all(|value| log.values.contains(value)), "{:?}", log.values);
-    }
-}
+mod tests;

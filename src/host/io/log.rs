@@ -18,7 +18,7 @@ use packwatch_formats::{Channel as LogChannel, Item};
 use serde::Serialize;
 
 use super::candump::{Body, Line, LineError, LineHead, LineParser, ParsedLine};
-use super::csv_log::{CsvLog, CsvOptions, RowTime};
+use super::csv_log::{self, CsvLog, CsvOptions, RowTime, TableReading};
 use super::journal;
 use super::lines::{self, Lines, RawLine};
 use super::segments;
@@ -95,6 +95,9 @@ pub struct LogCounts {
     pub inputs: Vec<String>,
     /// Segments of a journal that are missing before the first segment read (deleted or not given).
     pub deleted_segments: u64,
+    /// What was read of each table.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub tables: Vec<TableReading>,
 }
 
 /// Reads logs one after another.
@@ -267,6 +270,7 @@ impl LogSource {
                 },
             };
             if !more {
+                self.note_table();
                 self.current = None;
             }
         }
@@ -306,6 +310,15 @@ impl LogSource {
         Ok(true)
     }
 
+    /// Updates the counts of the current table.
+    fn note_table(&mut self) {
+        if let Some(OpenLog { form: LogForm::Csv(log), .. }) = &self.current
+            && let Some(last) = self.state.counts.tables.last_mut()
+        {
+            last.clone_from(log.reading());
+        }
+    }
+
     fn open(&mut self, paths: &[PathBuf]) -> Result<OpenLog, LogError> {
         let path = paths.first().map_or(Path::new(""), PathBuf::as_path);
         let name = path.display().to_string();
@@ -324,20 +337,16 @@ impl LogSource {
             let found = String::from_utf8_lossy(first);
             return Err(LogError::Data(format!("{name}:1: found {found:?}, must be {:?}", journal::HEADER)));
         }
-        let csv = !journal && (named_csv(path) || (!first.starts_with(b"(") && first.contains(&b',')));
+        let csv = !journal && csv_log::is_table(path, lines.unread());
         let form = if csv {
-            LogForm::Csv(Box::new(CsvLog::open(Box::new(lines.into_reader()), &name, &self.csv)?))
+            let log = CsvLog::open(Box::new(lines.into_reader()), path, &self.csv)?;
+            self.state.counts.tables.push(log.reading().clone());
+            LogForm::Csv(Box::new(log))
         } else {
             LogForm::Text { lines, journal }
         };
         Ok(OpenLog { name, form })
     }
-}
-
-/// Whether the name ends with `.csv`, `.csv.gz` or `.csv.zst`.
-fn named_csv(path: &Path) -> bool {
-    let name = path.file_name().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
-    name.trim_end_matches(".gz").trim_end_matches(".zst").ends_with(".csv")
 }
 
 /// Whether a line is blank or a comment.

@@ -13,6 +13,7 @@ pub mod lines;
 pub mod log;
 pub mod paths;
 pub mod place;
+pub mod plausible;
 pub mod record;
 pub mod result_file;
 mod row_limit;
@@ -26,4 +27,5 @@ pub mod text_table;
 pub mod ticks;
 #[cfg(feature = "formats")]
 mod tool_log;
+pub mod units;
 pub mod unix_socket;

@@ -24,11 +24,15 @@ impl RowLimit {
     }
 }
 
+/// The error of a row that is too long.
+pub(super) fn too_long() -> Error {
+    Error::new(ErrorKind::InvalidData, format!("row too long, must be at most {MAX_ROW_BYTES} bytes"))
+}
+
 impl Read for RowLimit {
     fn read(&mut self, buffer: &mut [u8]) -> Result<usize> {
         if self.since_row.get() > MAX_ROW_BYTES {
-            let error = format!("row too long, must be at most {MAX_ROW_BYTES} bytes");
-            return Err(Error::new(ErrorKind::InvalidData, error));
+            return Err(too_long());
         }
         let read = self.source.read(buffer)?;
         self.since_row.set(self.since_row.get() + read);

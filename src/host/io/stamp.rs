@@ -43,6 +43,78 @@ pub fn parse_stamp(text: &str) -> Option<Timestamp> {
     }
 }
 
+/// Parses a date with a time of day as programs write them: ISO 8601 with or without an offset from UTC,
+/// `11/14/2023 10:13:20 PM`, `14.11.2023 22:13:20` or `14-Nov-23 22:13:20`. Without an offset the time is UTC.
+/// `is_day_first` decides between day and month of `03/04/2023`.
+pub fn parse_date(text: &str, is_day_first: bool) -> Option<Timestamp> {
+    let text = text.trim();
+    let (date, time) = text.split_once(' ').or_else(|| text.split_once('T'))?;
+    let (year, month, day) = parse_day(date, is_day_first)?;
+    let time = time.trim().replace(',', ".").to_ascii_uppercase();
+    let (time, half_day) = match (time.strip_suffix("AM"), time.strip_suffix("PM")) {
+        (Some(rest), _) => (rest.trim(), Some(0)),
+        (_, Some(rest)) => (rest.trim(), Some(12)),
+        _ => (time.as_str(), None),
+    };
+    let (time, offset_s) = split_offset(time)?;
+    let stamp = parse_iso(&format!("{year:04}-{month:02}-{day:02}"), time)?;
+    let hour = stamp.nanos().div_euclid(3_600_000_000_000).rem_euclid(24);
+    let shift_h = match half_day {
+        Some(half) if (1..=12).contains(&hour) => half - if hour == 12 { 12 } else { 0 },
+        Some(_) => return None,
+        None => 0,
+    };
+    Some(stamp.plus_nanos((shift_h * 3600 - offset_s) * 1_000_000_000))
+}
+
+/// Splits the offset from UTC off a time of day; returns seconds.
+fn split_offset(time: &str) -> Option<(&str, i64)> {
+    let time = time.strip_suffix('Z').unwrap_or(time);
+    let Some(start) = time.rfind(['+', '-']) else { return Some((time, 0)) };
+    let digits = time[start + 1..].replace(':', "");
+    let (hours, minutes) =
+        (number(digits.get(..2)?)?, number(digits.get(2..).filter(|m| !m.is_empty()).unwrap_or("0"))?);
+    let seconds = hours * 3600 + minutes * 60;
+    Some((time[..start].trim_end(), if time.as_bytes()[start] == b'-' { -seconds } else { seconds }))
+}
+
+/// Year, month and day of a date.
+fn parse_day(text: &str, is_day_first: bool) -> Option<(i64, i64, i64)> {
+    const MONTHS: [&str; 12] = ["jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec"];
+    let parts: Vec<&str> = text.split(['-', '/', '.']).collect();
+    let [a, b, c] = parts[..] else { return None };
+    if a.len() == 4 {
+        return Some((number(a)?, number(b)?, number(c)?));
+    }
+    let year = number(c)? + if c.len() <= 2 { 2000 } else { 0 };
+    if let Some(month) = MONTHS.iter().position(|month| b.to_ascii_lowercase().starts_with(month)) {
+        return Some((year, month as i64 + 1, number(a)?));
+    }
+    let (a, b) = (number(a)?, number(b)?);
+    Some(if is_day_first || text.contains('.') { (year, b, a) } else { (year, a, b) })
+}
+
+/// Parses a duration or time of day: `h:mm:ss`, `m:ss.f`, or with days in front: `1d 02:03:04.5`, `1-02:03:04`.
+pub fn parse_clock(text: &str) -> Option<Timestamp> {
+    let text = text.trim();
+    let (days, time) = match text.split_once(['d', 'D']).or_else(|| text.split_once('-').filter(|of| !of.0.is_empty()))
+    {
+        Some((days, time)) => (number(days.trim())?, time.trim()),
+        None => (0, text),
+    };
+    let (is_negative, time) = time.strip_prefix('-').map_or((false, time), |rest| (true, rest));
+    let mut parts: Vec<&str> = time.split(':').collect();
+    let seconds = parse_exact(parts.pop()?.replace(',', ".").as_bytes())?;
+    let (hours, minutes) = match parts[..] {
+        [hours, minutes] => (number(hours)?, number(minutes)?),
+        [minutes] if time.contains(['.', ',']) => (0, number(minutes)?),
+        _ => return None,
+    };
+    let whole = ((days * 24 + hours) * 60 + minutes).checked_mul(60_000_000_000)?;
+    let nanos = seconds.plus_nanos(whole).nanos();
+    Some(Timestamp::from_nanos(if is_negative { -nanos } else { nanos }))
+}
+
 fn parse_iso(date: &str, time: &str) -> Option<Timestamp> {
     let mut parts = date.splitn(3, '-').map(number);
     let (year, month, day) = (parts.next()??, parts.next()??, parts.next()??);
@@ -125,6 +197,47 @@ mod tests {
         assert_eq!(nanos(".5"), Some(500_000_000));
         for bad in ["", "-", ".", "nan", "inf", "1.2.3", "12a", "--1"] {
             assert_eq!(nanos(bad), None, "{bad}");
+        }
+    }
+
+    #[test]
+    fn dates_of_programs_are_read() {
+        let expected = Some(1_700_000_000_000);
+        for (text, is_day_first) in [
+            ("2023-11-14T22:13:20Z", false),
+            ("2023-11-14 22:13:20.000", false),
+            ("2023-11-14T23:13:20+01:00", false),
+            ("2023/11/14 22:13:20", false),
+            ("11/14/2023 22:13:20", false),
+            ("14/11/2023 22:13:20", true),
+            ("11/14/2023 10:13:20 PM", false),
+            ("14.11.2023 22:13:20", false),
+            ("14-Nov-23 10:13:20 PM", false),
+        ] {
+            let found = parse_date(text, is_day_first).map(|time| time.nanos() / 1_000_000);
+            assert_eq!(found, expected, "{text}");
+        }
+        let hour = |text: &str| parse_date(text, false).map(|time| time.nanos() / 3_600_000_000_000 % 24);
+        assert_eq!((hour("11/14/2023 12:00:00 AM"), hour("11/14/2023 12:00:00 PM")), (Some(0), Some(12)));
+        for bad in ["14/11/2023 22:13:20", "2023-11-14", "11/14/2023 13:00:00 PM", "a b", "1/2/3/4 5:6:7"] {
+            assert_eq!(parse_date(bad, false), None, "{bad}");
+        }
+    }
+
+    #[test]
+    fn durations_with_colons_are_read() {
+        for (text, expected_ms) in [
+            ("00:00:01.500", Some(1500)),
+            ("100:00:01", Some(360_001_000)),
+            ("1d 02:03:04.5", Some(93_784_500)),
+            ("1-02:03:04", Some(93_784_000)),
+            ("0d 00:00:01,25", Some(1250)),
+            ("01:02.5", Some(62_500)),
+            ("01:02", None),
+            ("x:00:01", None),
+            ("1:2:3:4", None),
+        ] {
+            assert_eq!(parse_clock(text).map(|time| time.nanos() / 1_000_000), expected_ms, "{text}");
         }
     }
 

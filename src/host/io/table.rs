@@ -1,19 +1,27 @@
-//! Reads CSV tables. Columns are found by name, rows are streamed, and every fault has its position.
+//! Reads tables. Columns are found by name, rows are streamed, and every fault has its position.
 //!
-//! In: CSV with one header line, uncompressed or as gzip or zstd. Out: [`Row`]s whose fields are read as text, numbers
-//! or stamps. Blanks around fields and a byte order mark are removed. Rows may be shorter or longer than the header; a
-//! missing field counts as empty. A row of more than a megabyte ends the reading. The message of a fault is `FILE:LINE:
-//! column NAME: found X, must be ALLOWED`. A fault does not end the reading, so the caller may skip the row.
+//! In: text with a header line, uncompressed or as gzip or zstd; with the feature `parquet` also Parquet files. Out:
+//! [`Row`]s whose fields are read as text, numbers or stamps. Fields are separated by commas, semicolons, tabs or bars.
+//! Except between commas, a number may have a decimal comma. The text is UTF-8 or UTF-16. Blanks around fields and a
+//! byte order mark are removed. A second header line may state the units. Rows may be shorter or longer than the
+//! header; a missing field counts as empty. A row of more than a megabyte ends the reading. The message of a fault is
+//! `FILE:LINE: column NAME: found X, must be ALLOWED`. A fault does not end the reading, so the caller may skip the
+//! row. Control characters in names are escaped.
 
 use std::borrow::Cow;
 use std::cell::Cell;
-use std::io::Read;
+use std::io::{Cursor, Read};
 use std::ops::RangeInclusive;
 use std::path::Path;
 use std::rc::Rc;
 use std::sync::Arc;
 
-use super::row_limit::RowLimit;
+#[cfg(feature = "formats")]
+mod parquet;
+mod text;
+
+use super::row_limit::{MAX_ROW_BYTES, RowLimit};
+use super::units::Unit;
 use super::{lines, stamp};
 use crate::quantity::Timestamp;
 
@@ -52,20 +60,38 @@ pub enum Quotes {
     Literal,
 }
 
+/// Number of columns that a message lists.
+const MAX_LISTED_COLUMNS: usize = 64;
+
 /// A table being read.
 pub struct Table {
-    reader: csv::Reader<RowLimit>,
-    /// Bytes read since the last row.
-    since_row: Rc<Cell<usize>>,
+    rows: Rows,
     record: csv::ByteRecord,
     header: Header,
 }
 
+/// The source of the rows.
+enum Rows {
+    Text {
+        reader: csv::Reader<RowLimit>,
+        /// Bytes read since the last row.
+        since_row: Rc<Cell<usize>>,
+        /// Number of lines before the first row.
+        lines_before: u64,
+    },
+    #[cfg(feature = "formats")]
+    Parquet(parquet::ParquetRows),
+}
+
 /// The file's name and its columns.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct Header {
     file: String,
+    line: u64,
     names: Vec<String>,
+    /// Units in a line of their own; empty = no such line.
+    units: Vec<String>,
+    has_decimal_comma: bool,
 }
 
 /// One row.
@@ -89,19 +115,81 @@ impl Table {
         Self::new(source, file, Quotes::Enclose)
     }
 
-    /// Reads the header of decompressed text. `file` is the name in messages.
+    /// Reads the header of decompressed text, which is its first line. `file` is the name in messages.
     ///
     /// # Errors
     /// Fails if the source cannot be read.
     pub fn new(source: Box<dyn Read>, file: String, quotes: Quotes) -> Result<Self, TableError> {
+        Self::find(source, file, quotes, &|_| 0).map(|(table, _)| table)
+    }
+
+    /// Reads the header of decompressed text, which may follow other lines. `score` rates the fields of a line: 0 = not
+    /// a header, else higher = more known columns. Also returns a table of the first rows, which does not consume rows.
+    ///
+    /// # Errors
+    /// Fails if the source cannot be read.
+    pub(super) fn find(
+        source: Box<dyn Read>,
+        file: String,
+        quotes: Quotes,
+        score: &dyn Fn(&[String]) -> usize,
+    ) -> Result<(Self, Self), TableError> {
+        let mut head = text::Head::read(source);
+        let form = text::form(&head.bytes, score);
         let mut builder = csv::ReaderBuilder::new();
-        builder.quoting(quotes == Quotes::Enclose).flexible(true).trim(csv::Trim::All);
-        let (source, since_row) = RowLimit::new(source);
-        let mut reader = builder.from_reader(source);
-        let fields = reader.byte_headers().map_err(|error| damaged(&file, &error))?;
-        let name = |field| String::from_utf8_lossy(field).trim_start_matches('\u{feff}').trim_matches('"').to_owned();
-        let names = fields.iter().map(name).collect();
-        Ok(Self { reader, since_row, record: csv::ByteRecord::new(), header: Header { file, names } })
+        builder.quoting(quotes == Quotes::Enclose).flexible(true).trim(csv::Trim::All).has_headers(false);
+        builder.delimiter(form.separator);
+        let before = &head.bytes[form.start.min(head.bytes.len())..];
+        if !head.is_whole && memchr::memchr2(b'\n', b'\r', before).is_none() {
+            let failed = head.rest.read(&mut [0]).err();
+            let error = failed.unwrap_or_else(super::row_limit::too_long);
+            return Err(TableError::of_io(format!("{file}: damaged: {error}"), &error));
+        }
+        let before = &head.bytes[form.start.min(head.bytes.len())..];
+        let mut reader = builder.from_reader(before);
+        let mut names = csv::ByteRecord::new();
+        reader.read_byte_record(&mut names).map_err(|error| damaged(&file, &error))?;
+        let line =
+            lines_in(&head.bytes[..form.start.min(head.bytes.len())]) + names.position().map_or(1, csv::Position::line);
+        let mut start = form.start + reader.position().byte() as usize;
+        let mut units = csv::ByteRecord::new();
+        let has_units = matches!(reader.read_byte_record(&mut units), Ok(true)) && is_unit_row(&units);
+        if has_units {
+            start = form.start + reader.position().byte() as usize;
+        } else {
+            units.clear();
+        }
+        let text_of = |record: &csv::ByteRecord| record.iter().map(name_of).collect();
+        let has_decimal_comma = form.separator != b',';
+        let header =
+            Header { file, line: line.max(1), names: text_of(&names), units: text_of(&units), has_decimal_comma };
+        let data = head.bytes.split_off(start.min(head.bytes.len()));
+        let lines_before = lines_in(&head.bytes);
+        let whole_rows =
+            if head.is_whole { data.len() } else { memchr::memrchr(b'\n', &data).map_or(0, |end| end + 1) };
+        let preview = Box::new(Cursor::new(data[..whole_rows].to_vec()));
+        let open = |source: Box<dyn Read>| {
+            let (source, since_row) = RowLimit::new(source);
+            let rows = Rows::Text { reader: builder.from_reader(source), since_row, lines_before };
+            Self { rows, record: csv::ByteRecord::new(), header: header.clone() }
+        };
+        Ok((open(Box::new(Cursor::new(data).chain(head.rest))), open(preview)))
+    }
+
+    /// Opens a Parquet file, and the same file again for a look at its first rows.
+    ///
+    /// # Errors
+    /// Fails if the file cannot be read.
+    #[cfg(feature = "formats")]
+    pub(super) fn open_parquet(path: &Path) -> Result<(Self, Self), TableError> {
+        let open = || {
+            let (rows, names) = parquet::ParquetRows::open(path)?;
+            let names = names.iter().map(|name| escaped(name)).collect();
+            let file = path.display().to_string();
+            let header = Header { file, line: 1, names, units: Vec::new(), has_decimal_comma: false };
+            Ok(Self { rows: Rows::Parquet(rows), record: csv::ByteRecord::new(), header })
+        };
+        Ok((open()?, open()?))
     }
 
     /// The file's name and its columns.
@@ -114,11 +202,59 @@ impl Table {
     /// # Errors
     /// Fails if the source fails, for example because a compressed file is damaged.
     pub fn next_row(&mut self) -> Result<Option<Row<'_>>, TableError> {
-        self.since_row.set(0);
-        let more = self.reader.read_byte_record(&mut self.record).map_err(|e| damaged(&self.header.file, &e))?;
-        let line = self.record.position().map_or(0, csv::Position::line);
+        let (more, line) = match &mut self.rows {
+            Rows::Text { reader, since_row, lines_before } => {
+                since_row.set(0);
+                let more = reader.read_byte_record(&mut self.record).map_err(|e| damaged(&self.header.file, &e))?;
+                (more, *lines_before + self.record.position().map_or(0, csv::Position::line))
+            }
+            #[cfg(feature = "formats")]
+            Rows::Parquet(rows) => {
+                let more = rows.next(&mut self.record);
+                (
+                    more.map_err(|what| TableError::Data(format!("{}: damaged: {what}", self.header.file)))?,
+                    rows.number(),
+                )
+            }
+        };
         Ok(more.then_some(Row { line, record: &self.record, header: &self.header }))
     }
+}
+
+/// Whether the first bytes of a text contain a header line.
+pub(super) fn has_header(head: &[u8], score: &dyn Fn(&[String]) -> usize) -> bool {
+    text::form(head, score).is_known
+}
+
+/// Number of line feeds.
+fn lines_in(bytes: &[u8]) -> u64 {
+    memchr::memchr_iter(b'\n', bytes).count() as u64
+}
+
+/// The name of a column, without quotes, for messages and as key.
+fn name_of(field: &[u8]) -> String {
+    let text = String::from_utf8_lossy(field);
+    escaped(text.trim_start_matches('\u{feff}').trim_matches('"'))
+}
+
+/// Replaces characters that act on a terminal or reverse the text by their escapes.
+pub(super) fn escaped(text: &str) -> String {
+    let acts = |c: char| {
+        c.is_control()
+            || matches!(c, '\u{200b}'..='\u{200f}' | '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}' | '\u{feff}')
+    };
+    let mut out = String::with_capacity(text.len());
+    for c in text.chars() {
+        if acts(c) { out.extend(c.escape_unicode()) } else { out.push(c) }
+    }
+    out
+}
+
+/// Whether a row states units, such as `s,mA,[V]`: it has two units or more, and no digits.
+fn is_unit_row(record: &csv::ByteRecord) -> bool {
+    let has_digit = record.iter().any(|field| field.iter().any(u8::is_ascii_digit));
+    let bare = |field: &[u8]| String::from_utf8_lossy(field).trim_matches(['[', ']', '(', ')', '"', ' ']).to_owned();
+    !has_digit && record.iter().filter(|field| Unit::find(&bare(field)).is_some()).count() >= 2
 }
 
 fn damaged(file: &str, error: &csv::Error) -> TableError {
@@ -130,9 +266,28 @@ fn damaged(file: &str, error: &csv::Error) -> TableError {
 }
 
 impl Header {
+    /// Name of the file.
+    pub fn file(&self) -> &str {
+        &self.file
+    }
+
     /// The columns' names.
     pub fn names(&self) -> &[String] {
         &self.names
+    }
+
+    /// The unit of a column if a line of its own states the units; empty if unknown.
+    pub(super) fn unit_text(&self, column: usize) -> &str {
+        self.units.get(column).map_or("", String::as_str)
+    }
+
+    /// The columns for messages, at most 64.
+    pub(super) fn listed(&self) -> String {
+        let mut text = self.names[..self.names.len().min(MAX_LISTED_COLUMNS)].join(",");
+        if self.names.len() > MAX_LISTED_COLUMNS {
+            text += &format!(" and {} more", self.names.len() - MAX_LISTED_COLUMNS);
+        }
+        text
     }
 
     /// Index of the column called `name`.
@@ -150,13 +305,13 @@ impl Header {
     /// # Errors
     /// Fails if the table has none of these columns.
     pub fn required(&self, names: &[&str]) -> Result<usize, TableError> {
-        let missing = || self.fault(format!("no column {}, found {}", names.join(" or "), self.names.join(",")));
+        let missing = || self.fault(format!("no column {}, found {}", names.join(" or "), self.listed()));
         self.find_any(names).ok_or_else(missing)
     }
 
     /// A fault of the header line.
     pub fn fault(&self, what: impl std::fmt::Display) -> TableError {
-        TableError::Data(format!("{}:1: {what}", self.file))
+        TableError::Data(format!("{}:{}: {what}", self.file, self.line))
     }
 
     /// A fault of the whole file.
@@ -194,9 +349,20 @@ impl<'t> Row<'t> {
         range: RangeInclusive<f64>,
         allowed: &str,
     ) -> Result<Option<f64>, TableError> {
-        let value = parse_field(self.bytes(column).unwrap_or_default());
+        let value = self.parsed(column);
         let value = value.filter(|value| value.is_none_or(|value| range.contains(&value)));
         value.ok_or_else(|| self.fault(column, allowed))
+    }
+
+    /// A finite number: `Some(None)` if the field is empty or missing, `None` if it is not a finite number.
+    pub(super) fn parsed(&self, column: usize) -> Option<Option<f64>> {
+        let field = self.bytes(column).unwrap_or_default();
+        let value = parse_field(field);
+        if value.is_some() || !self.header.has_decimal_comma || !field.contains(&b',') {
+            return value;
+        }
+        // A decimal comma. Several commas separate thousands, which is not a number here.
+        parse_field(&field.iter().map(|&byte| if byte == b',' { b'.' } else { byte }).collect::<Vec<_>>())
     }
 
     /// A point in time: a date, or seconds.

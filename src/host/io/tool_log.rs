@@ -20,9 +20,19 @@ impl ToolLog {
     /// Recognises a log from its first bytes. `None` = no format of another tool.
     ///
     /// # Errors
-    /// Fails if the source cannot be read.
+    /// Fails if the source cannot be read, or if it has a known format that packwatch does not read. The error then
+    /// names the format and a converter.
     pub(super) fn recognise(lines: &mut Lines) -> io::Result<Option<Format>> {
-        Ok(Format::recognise(lines.peek_bytes(Format::HEAD_BYTES)?))
+        if begins_with_unix_stamp(lines.peek()?) {
+            // A candump log or journal. A live source must not wait until it has sent a whole head.
+            return Ok(None);
+        }
+        let head = lines.peek_bytes(Format::HEAD_BYTES)?;
+        let format = Format::recognise(head);
+        match packwatch_formats::foreign(head).filter(|_| format.is_none()) {
+            Some((name, advice)) => Err(io::Error::other(format!("its format is {name}; {advice}"))),
+            None => Ok(format),
+        }
     }
 
     /// Opens a log of a recognised format.
@@ -61,6 +71,13 @@ impl ToolLog {
             None => "unknown channel".to_owned(),
         }
     }
+}
+
+/// Whether a line begins like a candump log with absolute stamps: `(`, at least nine digits, `.`.
+fn begins_with_unix_stamp(line: &[u8]) -> bool {
+    let digits = line.strip_prefix(b"(").unwrap_or_default();
+    let count = digits.iter().take_while(|byte| byte.is_ascii_digit()).count();
+    count >= 9 && digits.get(count) == Some(&b'.')
 }
 
 /// The file itself if it is a regular file that begins with `head`, that is, if it is not compressed.

@@ -24,38 +24,50 @@ pub struct LogReading {
     pub channels: Vec<(String, String)>,
     /// For CSV logs: maps roles to columns, see [`CsvOptions::columns`].
     pub columns: Vec<(String, String)>,
-    /// For CSV logs: whether a positive current is a charge.
-    pub charge_positive: bool,
+    /// For CSV logs: whether a positive current is a charge; `None` = the file decides.
+    pub charge_positive: Option<bool>,
     /// For CSV logs: table with the start of each section, see [`CsvOptions::start_times`].
     pub start_times: Option<PathBuf>,
 }
 
 impl LogReading {
-    /// Returns the options for reading a CSV log of a pack with `cells` cells, whose voltage is the pack's total or one per
-    /// cell.
-    pub fn csv_options(&self, cells: u16, pack_total: bool) -> CsvOptions {
+    /// Returns the options for reading a table; `pack` are the options that follow from the pack.
+    pub fn csv_options(&self, pack: CsvOptions) -> CsvOptions {
         CsvOptions {
             columns: self.columns.clone(),
             charge_positive: self.charge_positive,
             start_times: self.start_times.clone(),
-            cells,
-            pack_total,
+            ..pack
         }
     }
 
     /// Returns the options for reading a log with this configuration.
     pub fn options(&self, config: &Config) -> LogOptions {
-        let sample = &config.monitor.sample;
         LogOptions {
             interfaces: config.interface_names(),
             channels: self.channels.clone(),
             strict: self.strict,
-            csv: self.csv_options(sample.cells, matches!(sample.voltage_source, VoltageSource::PackTotal { .. })),
+            csv: self.csv_options(table_options(&config.monitor)),
             encode_row: {
                 let mut row_frames = RowFrames::new(&config.monitor);
                 Box::new(move |values, frames| row_frames.encode(values, frames))
             },
         }
+    }
+}
+
+/// What a table of samples must fit: cells, sensors and size of the pack.
+fn table_options(config: &MonitorConfig) -> CsvOptions {
+    let sample = &config.sample;
+    let sensors = sample.sensor_of_cell.iter().flatten().map(|sensor| sensor.0.saturating_add(1)).max();
+    CsvOptions {
+        cells: sample.cells,
+        series: sample.series(),
+        sensors: sensors.unwrap_or_default(),
+        pack_total: matches!(sample.voltage_source, VoltageSource::PackTotal { .. }),
+        reported_soc: sample.reported_soc.is_some(),
+        capacity_ah: Some(config.model.rated_capacity_ah * f64::from(sample.strings)),
+        ..CsvOptions::default()
     }
 }
 

@@ -40,7 +40,7 @@ fn log(config: &Config, folder: &Path) -> LogSource {
         interfaces: config.interface_names(),
         channels: Vec::new(),
         strict: true,
-        csv: CsvOptions { columns: Vec::new(), charge_positive: false, start_times: None, cells: 1, pack_total: false },
+        csv: CsvOptions { cells: 1, ..CsvOptions::default() },
         encode_row: Box::new(move |values, frames| {
             let uncarried = encoder.encode(values, frames);
             protector.protect(frames);

@@ -16,7 +16,7 @@ use crate::can::CanId;
 use crate::cell::Label;
 use crate::fit::quoted;
 use crate::import::{DiagnosticSignal, DiagnosticTable, series};
-use crate::wiring::evidence::PackQuantity;
+use crate::wiring::evidence::{HIDDEN_SOC, PackQuantity};
 
 /// Why a signal is missing, and the next step.
 const NO_CANDIDATE: &str =
@@ -169,8 +169,6 @@ impl Writer<'_> {
 
     /// The numbers of cells in series with which a pack voltage is plausible. A state of charge narrows the range.
     fn fitting_cells(&self, pack: &Candidate) -> (u32, u32) {
-        /// Largest difference between the state of charge of a dashboard and that of the cells.
-        const HIDDEN: f64 = 0.13;
         let label = &self.descriptions.label;
         let (mut low_v, mut high_v) = (3.0, 4.2);
         let model =
@@ -180,7 +178,7 @@ impl Writer<'_> {
             if let Some(soc) = self.best(PackQuantity::Soc) {
                 let ocv_v = |soc: f64| model.ocv_v(&model.grid_position(soc.clamp(0.0, 1.0), 25.0));
                 // Under load, the voltage differs from the open-circuit voltage.
-                (low_v, high_v) = (ocv_v(soc.low / 100.0 - HIDDEN) - 0.05, ocv_v(soc.high / 100.0 + HIDDEN) + 0.05);
+                (low_v, high_v) = (ocv_v(soc.low / 100.0 - HIDDEN_SOC) - 0.05, ocv_v(soc.high / 100.0 + HIDDEN_SOC) + 0.05);
             }
         }
         ((pack.high / high_v).ceil() as u32, (pack.low / low_v).floor() as u32)

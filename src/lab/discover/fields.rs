@@ -213,7 +213,7 @@ fn currents<'a>(
             if codes.is_constant() || codes.is_counter() || is_same {
                 continue;
             }
-            let Some(zero) = zero_code(&codes) else { continue };
+            let Some(zero) = codes.zero_code(1.0) else { continue };
             let others = voltages.iter().filter(|voltage| !shares_bits(voltage, samples.key.1, &layout));
             let related = others
                 .filter_map(|voltage| Some((Slope::between(&voltage.series, &codes)?, voltage.series.extent.mean())));
@@ -242,18 +242,6 @@ fn currents<'a>(
     }
     found.sort_by(|a, b| b.0.total_cmp(&a.0).then_with(|| a.1.name.cmp(&b.1.name)));
     found.into_iter().take(12).map(|(_, signal)| signal).collect()
-}
-
-/// The code that means zero: 0, or an offset if the codes never come near zero. `None` if no usual offset fits.
-pub(super) fn zero_code(codes: &Series) -> Option<f64> {
-    let (low, high) = (codes.extent.min, codes.extent.max);
-    if low - 3.0 * (high - low) <= 0.0 {
-        return Some(0.0);
-    }
-    // The middle of a 16-bit and a 12-bit field, then round numbers, the roundest first.
-    let powers = [32_768.0, 32_767.0, 2048.0, 32_000.0].into_iter();
-    let round = [10_000.0, 5000.0, 1000.0, 500.0, 100.0].into_iter().map(|step| (high / step).floor() * step);
-    powers.chain(round).find(|zero| (low..=high).contains(zero))
 }
 
 /// Whether a field overlaps a layout in the message `id`, on any interface: gateways repeat messages on other

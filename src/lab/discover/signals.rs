@@ -11,7 +11,7 @@ use crate::can::decode::Binding;
 use crate::can::unit::{Quantity, SignalUnit};
 use crate::import::{DiagnosticSignal, DiagnosticTable};
 use crate::quantity::{Channel, Fault};
-use crate::wiring::evidence::{Series, SignalLabel, recorded_value};
+use crate::wiring::evidence::{STEADY_A, Series, SignalLabel, recorded_value};
 
 /// Smallest number of valid values of a signal.
 const MIN_VALUES: u64 = 2;
@@ -107,15 +107,11 @@ fn of_message(key: MessageKey, payloads: &Payloads, file: usize, message: &Messa
 
 /// The offset (A) of a current whose description has none: its values never come near zero, and no pack has them.
 fn missing_offset(series: &Series, signal: &Signal) -> Option<f64> {
-    /// Larger currents of a car are short peaks.
-    const LARGE_A: f64 = 1000.0;
     let factor = signal.layout.factor;
-    if series.extent.min.abs().min(series.extent.max.abs()) < LARGE_A || factor <= 0.0 || signal.layout.offset != 0.0 {
+    if series.extent.min.abs().min(series.extent.max.abs()) < STEADY_A || factor <= 0.0 || signal.layout.offset != 0.0 {
         return None;
     }
-    let values = series.values.kept().iter().zip(0_u32..);
-    let codes = Series::of(values.map(|(value, n)| (f64::from(n), Ok(value / factor))));
-    fields::zero_code(&codes).filter(|zero| *zero != 0.0).map(|zero| -zero * factor)
+    series.zero_code(factor).filter(|zero| *zero != 0.0).map(|zero| -zero * factor)
 }
 
 /// The direction of a positive current that a DBC's comment states, such as "positive = charge".

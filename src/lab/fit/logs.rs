@@ -237,6 +237,7 @@ fn fit_stretches(
         measured: MeasuredRange::of(&fit.records),
         by_kind: None,
         files: files(request, &fit.records, &file_of_record, &fit.fitted.tables),
+        tables: Vec::new(),
         records: fit.records,
         file_of_record,
         notes,

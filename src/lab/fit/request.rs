@@ -7,6 +7,7 @@ use std::path::PathBuf;
 
 use crate::cell::MAX_BRANCHES;
 use crate::error::{LabError, check_values as check};
+use crate::io::csv_log::CsvOptions;
 use crate::quantity::bounds;
 
 /// Maximum number of SOC breakpoints: one per percent. The duration of a fit grows with the cube of their number.
@@ -42,6 +43,8 @@ pub struct FitRequest {
     /// For an ageing cell: only the parts whose number in the column `cycle` is at most this number are used; `ocv` and
     /// `capacity_ah` must then be empty. `None` = the cell is not ageing.
     pub first_cycles: Option<usize>,
+    /// Columns and sign of the files, if their headers do not say it.
+    pub table: CsvOptions,
     /// Files to fit; at least one.
     pub files: Vec<PathBuf>,
 }

@@ -11,6 +11,7 @@ use super::life::{LifeRecorder, LifeScore};
 use super::soc::{self, SocSample, SocScore};
 use super::{ScoreJob, ScoreSettings, picture, window};
 use crate::error::LabError;
+use crate::io::csv_log::TableReading;
 use crate::measured::{MeasuredFile, MeasuredPart};
 use crate::monitor::{EventKind, MonitorConfig};
 use crate::quantity::Timestamp;
@@ -74,6 +75,9 @@ pub struct CaseScore {
     /// The case.
     #[serde(flatten)]
     pub case: Case,
+    /// What was read of the file.
+    #[serde(skip)]
+    pub reading: TableReading,
     /// Rows fed to the monitor.
     pub rows: usize,
     /// Number of values that no frame can carry.
@@ -124,7 +128,7 @@ pub(super) fn run(
         });
     }
     progress(rows.saturating_sub(done) as f64 / rows as f64);
-    run.finish(case)
+    run.finish(case, &file.reading)
 }
 
 /// First row of a case.
@@ -303,7 +307,7 @@ impl<'a> CaseRun<'a> {
         }
     }
 
-    fn finish(mut self, case: &Case) -> Result<CaseScore, LabError> {
+    fn finish(mut self, case: &Case, reading: &TableReading) -> Result<CaseScore, LabError> {
         if let Some((_, latest)) = self.span {
             self.feeder.unknown_gap(latest);
             self.take_events();
@@ -320,6 +324,7 @@ impl<'a> CaseRun<'a> {
             path: job.path.clone(),
             name: job.name.clone(),
             case: *case,
+            reading: reading.clone(),
             rows: self.rows,
             uncarried_values: self.feeder.uncarried(),
             resets: self.resets,

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use super::feed::{Feeder, Learned, UNKNOWN_GAP_NS};
 use crate::error::LabError;
+use crate::io::csv_log::CsvOptions;
 use crate::measured::MeasuredFile;
 use crate::monitor::MonitorConfig;
 use crate::quantity::Timestamp;
@@ -18,6 +19,7 @@ const PROGRESS_ROWS: usize = 4096;
 /// A file cannot be read.
 pub fn learn(
     files: &[PathBuf],
+    table: &CsvOptions,
     config: &MonitorConfig,
     sleep_gap_s: f64,
     progress: &dyn Fn(),
@@ -27,7 +29,7 @@ pub fn learn(
     let mut latest = Timestamp::ZERO;
     for path in files {
         progress();
-        for part in &MeasuredFile::read(path)?.parts {
+        for part in &MeasuredFile::read(path, table)?.parts {
             let Some(&first_s) = part.time_s.first() else { continue };
             let base = latest.plus_nanos(UNKNOWN_GAP_NS).plus_secs(-first_s);
             feeder.unknown_gap(base.plus_secs(first_s));

@@ -10,6 +10,7 @@ use super::{Case, CaseScore, CycleTable, ScoreJob, ScoreReport, ScoreSettings, S
 use crate::config::Config;
 use crate::error::{LabError, RequestError, check_values as check, create_folder};
 use crate::health::UsableConfig;
+use crate::io::csv_log::CsvOptions;
 use crate::io::paths::{check_distinct, short_names};
 use crate::single_cell::CellSource;
 
@@ -40,6 +41,8 @@ pub struct ScoreRequest {
     pub settle_s: f64,
     /// Charge from full to empty that defines the true SOC (Ah); `None` = the model's capacity.
     pub truth_capacity_ah: Option<f64>,
+    /// Columns and sign of the files, if their headers do not say it.
+    pub table: CsvOptions,
     /// If a gap between two rows is longer than this (s), the recorder counts as asleep.
     pub sleep_gap_s: f64,
     /// Tables of published capacities, one per file; empty without tables.
@@ -66,6 +69,7 @@ impl Default for ScoreRequest {
             files: vec![],
             source: CellSource::default(),
             learn: vec![],
+            table: CsvOptions::default(),
             start: vec![Start::Full],
             remove: 0.3,
             soc_error_points: vec![None],
@@ -219,11 +223,14 @@ impl ScoreRequest {
                 "no load for the usable capacity: --cycles needs --load CURRENT,TEMPERATURE,CUTOFF or a [usable] table",
             ));
         }
+        let model = &monitor.model;
+        let table = CsvOptions { capacity_ah: Some(model.rated_capacity_ah), ..self.table.clone() };
         let learned = match &self.learn[..] {
             [] => None,
-            files => Some(learn(files, &monitor, self.sleep_gap_s, progress)?),
+            files => Some(learn(files, &table, &monitor, self.sleep_gap_s, progress)?),
         };
         Ok(ScoreSettings {
+            table,
             learned,
             truth_capacity_ah: self.truth_capacity_ah.unwrap_or(monitor.model.capacity_ah),
             monitor,

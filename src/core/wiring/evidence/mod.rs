@@ -27,3 +27,4 @@ pub use label::{PackQuantity, Score, SignalLabel};
 pub use sample::{Extent, ThinnedSample};
 pub use series::{Series, UnusableCounts, recorded_value};
 pub use slope::Slope;
+pub use usage::{HIDDEN_SOC, STEADY_A};

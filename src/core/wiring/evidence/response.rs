@@ -136,6 +136,8 @@ pub(crate) struct VoltageResponse {
     previous: Option<BlockMean>,
     open_run: Option<OpenRun>,
     steps: Vec<CurrentStep>,
+    /// The largest absolute voltage steps (V), whatever the current did, largest first.
+    voltage_steps_v: [f64; 3],
     pub(crate) runs: Vec<SteadyRun>,
     pub(crate) rests: Vec<SteadyRun>,
     pub(crate) equal_cells: EqualCells,
@@ -208,6 +210,10 @@ impl VoltageResponse {
             before.cells_v.iter().zip(&after.cells_v).map(|(before, after)| (after - before) as f32).collect();
         let voltage_v = median(cells_v.iter().map(|v| f64::from(*v))).unwrap_or(f64::NAN);
         let step = CurrentStep { current_a: after.current_a - before.current_a, voltage_v, cells_v };
+        if voltage_v.abs() > self.voltage_steps_v[2] {
+            self.voltage_steps_v[2] = voltage_v.abs();
+            self.voltage_steps_v.sort_by(|a, b| b.total_cmp(a));
+        }
         // With 192 steps, the slope is accurate to a few per cent.
         if self.steps.len() < 192 {
             self.steps.push(step);
@@ -275,9 +281,9 @@ impl VoltageResponse {
         if largest < 5.0 * self.tolerance_a { Slope::of(points(0.2 * largest)) } else { Slope::fit(&all) }
     }
 
-    /// Largest step of the median cell's voltage (V).
-    pub(crate) fn largest_voltage_step(&self) -> f64 {
-        self.steps.iter().map(|step| step.voltage_v.abs()).filter(|v| v.is_finite()).fold(0.0, f64::max)
+    /// Third largest step of the median cell's voltage (V): one wrong reading makes two steps.
+    pub(crate) fn large_voltage_step(&self) -> f64 {
+        self.voltage_steps_v[2]
     }
 }
 

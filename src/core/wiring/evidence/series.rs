@@ -203,6 +203,19 @@ impl Series {
         5 * most > 3 * values.len().saturating_sub(1).min(200)
     }
 
+    /// The code that means zero in a signal of `factor` per code: 0, or an offset if the values never come near zero.
+    /// `None` if no usual offset lies among the codes.
+    pub fn zero_code(&self, factor: f64) -> Option<f64> {
+        let (low, high) = (self.extent.min / factor, self.extent.max / factor);
+        if low - 3.0 * (high - low) <= 0.0 {
+            return Some(0.0);
+        }
+        // The middle of a 16-bit and a 12-bit field, then round numbers, the roundest first.
+        let powers = [32_768.0, 32_767.0, 2048.0, 32_000.0].into_iter();
+        let round = [10_000.0, 5000.0, 1000.0, 500.0, 100.0].into_iter().map(|step| (high / step).floor() * step);
+        powers.chain(round).find(|zero| (low..=high).contains(zero))
+    }
+
     /// Largest step between consecutive kept values.
     pub fn largest_step(&self) -> f64 {
         self.values.kept().windows(2).map(|pair| (pair[1] - pair[0]).abs()).fold(0.0, f64::max)

@@ -14,6 +14,11 @@ const MAX_MOMENTS: usize = 1024;
 const MAX_HOLD_S: f64 = 40.0;
 /// Time constant of the smoothed current (s): the slow part of a cell's overvoltage follows a smoothed current.
 const SETTLE_S: f64 = 300.0;
+/// Largest difference between a reported state of charge and that of the cells: a vehicle hides a reserve at both ends,
+/// and the controller's estimate has an error.
+pub const HIDDEN_SOC: f64 = 0.13;
+/// A pack's current is never steadily above this (A): such a value has an offset.
+pub const STEADY_A: f64 = 1000.0;
 /// Number of reported values that are recorded.
 pub(crate) const MAX_REPORTED: usize = 8;
 

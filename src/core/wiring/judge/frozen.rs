@@ -39,17 +39,32 @@ fn voltages(judge: &mut Judge<'_>) {
         .advice("or the sender repeats an old value");
 }
 
+/// Finds a current that never changes, or hardly changes, although the voltages step as under a load.
 fn pack_current(judge: &mut Judge<'_>, (signal, series): SignalSeries<'_>) {
     let noise_v = judge.median_of(Kind::Voltage, Series::noise).unwrap_or(0.0);
-    let step_v = judge.observed.fast_response().largest_voltage_step() * judge.voltage_factor;
+    let step_v = judge.observed.fast_response().large_voltage_step() * judge.voltage_factor;
     let is_step = step_v > (10.0 * noise_v / judge.cells_per_reading() * judge.voltage_factor).max(0.008);
-    if series.count() < FEWEST_READINGS || series.extent.changes > 0 || !is_step {
+    let swing_a = series.values.bulk().map_or(0.0, |(low, high)| high - low) * judge.current_factor;
+    let model_ohm = judge.plan.pack.model.as_ref().map_or(0.0, |model| judge.model_ohm(model, 1.0).1);
+    // Cold and age may raise the resistance, but not tenfold.
+    let explained_v = 10.0 * swing_a * model_ohm / f64::from(judge.plan.pack.strings.max(1));
+    let is_related = judge.observed.slope().is_some_and(|slope| slope.certainty() >= 1.0 && slope.r2 >= 0.2);
+    let is_still = series.extent.changes == 0;
+    let is_dead = model_ohm > 0.0 && step_v > explained_v && !is_related;
+    if series.count() < FEWEST_READINGS || !is_step || !(is_still || is_dead) {
         return;
     }
-    let (value, step) = (number(series.extent.last), milli(step_v));
+    let step = milli(step_v);
+    let (title, value) = match is_still {
+        true => ("pack current: the value never changes", format!("is {} A", number(series.extent.last))),
+        false => {
+            let (low, high) = (number(series.extent.min), number(series.extent.max));
+            ("pack current: it hardly changes while the voltages step", format!("stays within {low} to {high} A"))
+        }
+    };
     let readings = count(series.count(), "reading");
-    error(judge, Topic::Frozen, "pack current: the value never changes")
-        .seen(format!("{} is {value} A in all {readings}, while the voltages step by up to {step} mV", signal.name))
+    error(judge, Topic::Frozen, title)
+        .seen(format!("{} {value} in all {readings}, while the voltages step by up to {step} mV", signal.name))
         .why("only a change of the current changes voltages this fast")
         .change(&signal.table, "signal", "the signal of the measured current");
 }

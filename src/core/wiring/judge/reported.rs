@@ -6,17 +6,15 @@ use super::context::{Judge, error};
 use super::ocv::{self, OcvEstimate};
 use super::text::{number, percent, toml};
 use crate::cell::{CellModel, Chemistry, Label};
-use crate::filter::median;
+use crate::filter::{ends, median};
 use crate::quantity::Channel;
-use crate::wiring::evidence::usage::ChargeSlope;
+use crate::wiring::evidence::HIDDEN_SOC;
+use crate::wiring::evidence::usage::{ChargeSlope, Moment};
 use crate::wiring::plan::SignalPlan;
 use crate::wiring::report::Topic;
 
 /// Smallest change of a reported state of charge that is compared with the counted charge.
 const LEAST_RANGE: f64 = 0.05;
-/// Part of the charge that a vehicle may hide from the driver, and error of its estimate: the largest difference
-/// between a reported state of charge and the state of charge of the cells.
-const HIDDEN: f64 = 0.13;
 /// A reported value contradicts the voltage if more than this share of the moments disagree. It agrees if at most the
 /// rest disagree.
 const MOST: f64 = 0.75;
@@ -52,7 +50,7 @@ pub(super) fn check_charge(judge: &mut Judge<'_>) {
             return one_sided(judge, current, side, &format!("{what} {verb}"));
         }
     }
-    let Some((signal, slope)) = found else { return };
+    let Some((signal, slope)) = found else { return too_much(judge, current) };
     let ratio = slope.capacity_ah / judge.pack_ah();
     let [counted, range] = [slope.charge_range_ah, 100.0 * slope.range].map(number);
     if slope.r2 < 0.3 {
@@ -67,6 +65,26 @@ pub(super) fn check_charge(judge: &mut Judge<'_>) {
     } else if slope.r2 >= 0.8 && ratio > 0.0 && !(0.55..=1.3).contains(&ratio) {
         size(judge, (signal, current), slope, ratio);
     }
+}
+
+/// Reports a counted charge that no pack of the configured capacity holds.
+fn too_much(judge: &mut Judge<'_>, current: &SignalPlan) {
+    let moments = judge.observed.usage.moments();
+    let counted = |stretch: &[Moment]| {
+        let (low, high) = ends(stretch.iter().map(|moment| moment.charge_ah));
+        high - low
+    };
+    let largest_ah = moments.chunk_by(|a, b| a.stretch == b.stretch).map(counted).fold(0.0, f64::max);
+    let pack_ah = judge.pack_ah();
+    // From full to empty is once the capacity; the offset of a sensor adds to it in a long log.
+    if largest_ah <= 2.0 * pack_ah {
+        return;
+    }
+    let [largest, pack] = [largest_ah, pack_ah].map(number);
+    error(judge, Topic::Unit, "pack current: more charge flows than the pack holds")
+        .seen(format!("{} counts {largest} Ah in one direction; the pack has {pack} Ah", current.name))
+        .why("the signal is not the current, its scale or offset is wrong, or the configured capacity is too small")
+        .change(&current.table, "signal", "the signal of the measured current");
 }
 
 /// Reports a constant current although the reported state of charge changes.
@@ -255,7 +273,7 @@ fn outside(judge: &Judge<'_>, points: &[(OcvEstimate, f64)], model: &CellModel, 
     let temperature_c = judge.temperature_c();
     let ocv_v = |soc: f64| model.ocv_v(&model.grid_position(soc.clamp(0.0, 1.0), temperature_c));
     let is_outside = |(estimate, soc): &&(OcvEstimate, f64)| {
-        let (low, high) = (ocv_v(soc - HIDDEN) - estimate.slack_v, ocv_v(soc + HIDDEN) + estimate.slack_v);
+        let (low, high) = (ocv_v(soc - HIDDEN_SOC) - estimate.slack_v, ocv_v(soc + HIDDEN_SOC) + estimate.slack_v);
         !(low..=high).contains(&(estimate.voltage_v * factor))
     };
     points.iter().filter(is_outside).count() as f64 / points.len().max(1) as f64

@@ -7,7 +7,7 @@ use super::unit::unit_of;
 use crate::can::signal::{ByteOrder, ValueType};
 use crate::quantity::Channel;
 use crate::wiring::evidence::layout::{AlternativeReading, LAYOUT_FAULTS};
-use crate::wiring::evidence::{Extent, Series};
+use crate::wiring::evidence::{Extent, STEADY_A, Series};
 use crate::wiring::plan::{Kind, SignalPlan};
 use crate::wiring::report::{Severity, Topic};
 
@@ -185,6 +185,9 @@ fn current(judge: &mut Judge<'_>) {
         judge.is_mixed_up = true;
         return wrong_layout(judge, &all, better, "pack current");
     }
+    if missing_offset(judge, &all[0]) {
+        return;
+    }
     let unit = unit_of(&signal.unit).map(|(_, factor, _)| factor).filter(|f| *f != 1.0 && signal.scale == 1.0);
     let c_rate = largest_a / judge.pack_ah();
     let finding = if let Some(factor) = unit {
@@ -204,6 +207,21 @@ fn current(judge: &mut Judge<'_>) {
         return;
     };
     finding.seen(format!("{} reads up to {} A", signal.name, number(largest_a)));
+}
+
+/// Reports a current that never comes near zero because its offset is missing.
+fn missing_offset(judge: &mut Judge<'_>, (signal, series): &SignalSeries<'_>) -> bool {
+    let (sign, factor) = (signal.binding.scale.signum(), (signal.layout.factor * signal.scale).abs());
+    let on_bus = Series::of(series.values.kept().iter().zip(0_u32..).map(|(value, n)| (f64::from(n), Ok(sign * value))));
+    let (low, high) = (on_bus.extent.min, on_bus.extent.max);
+    let Some(zero) = on_bus.zero_code(factor).filter(|zero| low > STEADY_A && *zero != 0.0) else { return false };
+    judge.is_mixed_up = true;
+    let offset_a = signal.offset - zero * factor;
+    error(judge, Topic::Unit, "the current never comes near zero: an offset is missing")
+        .seen(format!("{} reads {} to {} A", signal.name, number(low), number(high)))
+        .why(format!("no pack has such a current all the time; the code {} probably means 0 A", number(zero)))
+        .change(&signal.table, "offset", toml(offset_a));
+    true
 }
 
 /// Common wrong units of a temperature: factor, offset, name.

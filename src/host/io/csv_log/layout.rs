@@ -1,0 +1,298 @@
+//! Chooses the columns of a table of samples.
+//!
+//! In: the header and the options. Out: a [`Layout`]: for each role the column and its unit. A column has the name that
+//! the user gives, else a name of the [dictionary](super::dictionary). A unit that does not fit the role is an error.
+
+use super::CsvOptions;
+use super::dictionary::{Format, Known, Role, known};
+use crate::can::decode::{Channel, SensorIndex};
+use crate::io::table::{Header, PART_COLUMNS, TableError};
+use crate::io::units::{Quantity, Unit};
+use crate::quantity::CellIndex;
+
+/// A column and its unit.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Column {
+    pub(super) index: usize,
+    pub(super) unit: &'static Unit,
+    /// Whether the header or the user states the unit.
+    pub(super) is_stated: bool,
+}
+
+/// The columns of a table of samples.
+#[derive(Debug)]
+pub(super) struct Layout {
+    pub(super) format: Format,
+    pub(super) time: Column,
+    /// Whether the time restarts at each step.
+    pub(super) is_step_time: bool,
+    /// The column of each channel, in the order of the channels.
+    pub(super) channels: Vec<(Channel, Column)>,
+    pub(super) state: Option<usize>,
+    /// Charge taken out, and its factor -1 or 1.
+    pub(super) discharged: Option<(Column, f64)>,
+    pub(super) section: Option<usize>,
+    /// Whether the user names the section column.
+    pub(super) is_section_named: bool,
+}
+
+impl Layout {
+    pub(super) fn find(header: &Header, options: &CsvOptions) -> Result<Self, TableError> {
+        Columns::new(header, options).layout()
+    }
+
+    pub(super) fn current(&self) -> Option<Column> {
+        self.channels.iter().find(|(channel, _)| *channel == Channel::Current).map(|of| of.1)
+    }
+}
+
+struct Columns<'a> {
+    header: &'a Header,
+    options: &'a CsvOptions,
+    format: Format,
+    /// The known roles of each column.
+    known: Vec<(usize, Known)>,
+}
+
+impl<'a> Columns<'a> {
+    fn new(header: &'a Header, options: &'a CsvOptions) -> Self {
+        let roles = |(index, name): (usize, &String)| {
+            known(name, header.unit_text(index)).into_iter().map(move |known| (index, known)).collect::<Vec<_>>()
+        };
+        let known = header.names().iter().enumerate().flat_map(roles).collect();
+        Self { header, options, format: Format::of(header.names()), known }
+    }
+
+    fn layout(&self) -> Result<Layout, TableError> {
+        let (time, is_step_time) = self.time()?;
+        let mut channels = vec![(Channel::Current, self.required("current", Role::Current, Quantity::Current)?)];
+        self.temperatures(&mut channels)?;
+        self.voltages(&mut channels)?;
+        if self.options.reported_soc {
+            channels.extend(self.best(Role::Soc).map(|of| (Channel::ReportedSoc, self.column(of))));
+        }
+        channels.sort_by_key(|&(channel, _)| channel);
+        let discharged = self.best(Role::Discharged).map(|of| (self.column(of), 1.0));
+        let net = || self.best(Role::NetCharged).map(|of| (self.column(of), -1.0));
+        let (section, is_section_named) = self.section(is_step_time)?;
+        Ok(Layout {
+            format: self.format,
+            time,
+            is_step_time,
+            channels,
+            state: self.state()?,
+            discharged: discharged.or_else(net).filter(|(column, _)| column.is_stated),
+            section,
+            is_section_named,
+        })
+    }
+
+    fn mapped(&self, role: &str) -> Option<&'a str> {
+        self.options.columns.iter().rev().find(|(r, _)| r == role).map(|(_, column)| column.as_str())
+    }
+
+    /// The column that the user names. The name may end with a unit in brackets that the file does not have.
+    fn named(&self, role: &str, name: &str, quantity: Option<Quantity>) -> Result<Column, TableError> {
+        let stated = name.strip_suffix(']').and_then(|rest| rest.rsplit_once('['));
+        let exact = self.header.find(name).map(|index| (index, None));
+        let with_unit = || {
+            let (bare, unit) = stated?;
+            Some((self.header.find(bare.trim_end())?, Some(unit)))
+        };
+        let (index, unit_text) = exact.or_else(with_unit).ok_or_else(|| self.missing(role, name))?;
+        let base = quantity.map_or_else(|| Unit::base(Quantity::Share), Unit::base);
+        let Some(quantity) = quantity else { return Ok(Column { index, unit: base, is_stated: false }) };
+        let unit = match unit_text {
+            Some(text) => Some(
+                Unit::find(text)
+                    .ok_or_else(|| self.header.fault(format_args!("--column {role}={name}: unknown unit {text:?}")))?,
+            ),
+            None => self.unit_of(index),
+        };
+        if let Some(unit) = unit.filter(|unit| unit.quantity != quantity) {
+            let (name, symbol) = (&self.header.names()[index], unit.symbol);
+            return Err(self.header.fault(format_args!("column {name} is in {symbol}, so it cannot be the {role}")));
+        }
+        Ok(Column { index, unit: unit.unwrap_or(base), is_stated: unit.is_some() })
+    }
+
+    /// The unit that the name of a column states, even if the name itself is unknown.
+    fn unit_of(&self, index: usize) -> Option<&'static Unit> {
+        let name = super::column_name::ColumnName::parse(&self.header.names()[index], self.header.unit_text(index));
+        let of_role = self.known.iter().find(|(of, _)| *of == index).and_then(|(_, known)| known.unit);
+        of_role
+            .or(name.unit)
+            .or_else(|| name.with_last_word_as_unit().filter(|of| of.words.len() > 1).and_then(|of| of.unit))
+    }
+
+    fn missing(&self, role: &str, name: &str) -> TableError {
+        let what = if name.is_empty() { String::new() } else { format!(" {name}") };
+        self.header.fault(format_args!(
+            "no column{what} for {role}, found {}; name it with --column {role}=NAME, or {role}='NAME[UNIT]'",
+            self.header.listed()
+        ))
+    }
+
+    /// The best columns of a role: the known names of the most preferred line, in the order of the file.
+    fn best_all(&self, role: Role) -> Vec<(usize, Known)> {
+        let of_role = || self.known.iter().filter(|(_, known)| known.role == role);
+        let best = of_role().map(|(_, known)| known.rank).min();
+        of_role().filter(|(_, known)| Some(known.rank) == best).copied().collect()
+    }
+
+    fn best(&self, role: Role) -> Option<(usize, Known)> {
+        self.best_all(role).into_iter().next()
+    }
+
+    fn column(&self, (index, known): (usize, Known)) -> Column {
+        let base = Unit::base(known.role.quantity().unwrap_or(Quantity::Share));
+        Column { index, unit: known.unit.unwrap_or(base), is_stated: known.unit.is_some() }
+    }
+
+    fn required(&self, name: &str, role: Role, quantity: Quantity) -> Result<Column, TableError> {
+        match self.mapped(name) {
+            Some(column) => self.named(name, column, Some(quantity)),
+            None => self.best(role).map(|of| self.column(of)).ok_or_else(|| self.missing(name, "")),
+        }
+    }
+
+    /// The column of time, and whether its time restarts at each step. In Neware's exports `Time` is the time of the
+    /// step.
+    fn time(&self) -> Result<(Column, bool), TableError> {
+        if let Some(column) = self.mapped("time") {
+            return Ok((self.named("time", column, Some(Quantity::Time))?, false));
+        }
+        let total = self.best(Role::Time);
+        let is_step = |(index, _): &(usize, Known)| {
+            self.format == Format::Neware && known(&self.header.names()[*index], "").iter().any(|of| of.rank == 1)
+        };
+        let found = total.filter(|of| !is_step(of)).or_else(|| self.best(Role::Date)).map(|of| (of, false));
+        let found = found.or_else(|| self.best(Role::StepTime).or(total).map(|of| (of, true)));
+        found.map(|(of, is_step)| (self.column(of), is_step)).ok_or_else(|| self.missing("time", ""))
+    }
+
+    fn state(&self) -> Result<Option<usize>, TableError> {
+        match self.mapped("state") {
+            Some("") => Ok(None),
+            Some(column) => self.named("state", column, None).map(|column| Some(column.index)),
+            None => Ok(self.best(Role::State).map(|(index, _)| index)),
+        }
+    }
+
+    /// The column at whose new values the time restarts, and whether the user names it.
+    fn section(&self, is_step_time: bool) -> Result<(Option<usize>, bool), TableError> {
+        match self.mapped("section") {
+            Some("") => Ok((None, true)),
+            Some(column) => self.named("section", column, None).map(|column| (Some(column.index), true)),
+            None if is_step_time => Ok((self.best(Role::Step).map(|(index, _)| index), false)),
+            None if matches!(self.format, Format::Packwatch | Format::Unknown) => {
+                Ok((self.header.find_any(&PART_COLUMNS), false))
+            }
+            None => Ok((None, false)),
+        }
+    }
+
+    /// The columns of numbered sensors or cells that the user names by a pattern, as far as they exist.
+    fn numbered(&self, role: &str, pattern: &str, quantity: Quantity, most: u16) -> Result<Vec<Column>, TableError> {
+        let mut columns = Vec::new();
+        for n in 0..most {
+            match self.named(role, &pattern.replace("{n}", &(u32::from(n) + 1).to_string()), Some(quantity)) {
+                Ok(column) => columns.push(column),
+                Err(error) if n == 0 => return Err(error),
+                Err(_) => break,
+            }
+        }
+        Ok(columns)
+    }
+
+    /// Finds the temperature columns, which are optional: one column for the first sensor, or numbered columns.
+    fn temperatures(&self, channels: &mut Vec<(Channel, Column)>) -> Result<(), TableError> {
+        let sensors = |columns: Vec<Column>| {
+            columns.into_iter().zip(0..).map(|(column, n)| (Channel::Temperature(SensorIndex(n)), column))
+        };
+        if let Some(pattern) = self.mapped("temperature{n}") {
+            let columns = self.numbered("temperature{n}", pattern, Quantity::Temperature, u16::MAX)?;
+            channels.extend(sensors(columns));
+            return Ok(());
+        }
+        match self.mapped("temperature") {
+            Some("") => {}
+            Some(column) => {
+                channels.extend(sensors(vec![self.named("temperature", column, Some(Quantity::Temperature))?]))
+            }
+            None => {
+                let mut best = self.best_all(Role::Temperature);
+                // A sensor that the file has in two units counts once.
+                let mut numbers = Vec::new();
+                best.retain(|(_, known)| {
+                    let is_new = !numbers.contains(&known.number);
+                    numbers.push(known.number);
+                    is_new
+                });
+                best.sort_by_key(|(_, known)| known.number);
+                best.truncate(usize::from(self.options.sensors.max(1)));
+                channels.extend(sensors(best.into_iter().map(|of| self.column(of)).collect()));
+            }
+        }
+        Ok(())
+    }
+
+    fn voltages(&self, channels: &mut Vec<(Channel, Column)>) -> Result<(), TableError> {
+        let cells = self.options.cells;
+        let cell = |columns: Vec<Column>| {
+            columns.into_iter().zip(0..).map(|(column, n)| (Channel::CellVoltage(CellIndex(n)), column))
+        };
+        if let Some(pattern) = self.mapped("voltage{n}").filter(|_| !self.options.pack_total) {
+            let columns = self.numbered("voltage{n}", pattern, Quantity::Voltage, cells)?;
+            if columns.len() < usize::from(cells) {
+                return Err(self.missing("voltage{n}", &pattern.replace("{n}", &(columns.len() + 1).to_string())));
+            }
+            channels.extend(cell(columns));
+            return Ok(());
+        }
+        if self.options.pack_total {
+            channels.push((Channel::PackVoltage, self.required("voltage", Role::Voltage, Quantity::Voltage)?));
+            return Ok(());
+        }
+        let single = if self.mapped("voltage").is_some() { None } else { self.best(Role::Voltage) };
+        if cells == 1 && (single.is_some() || self.mapped("voltage").is_some()) {
+            channels.extend(cell(vec![self.required("voltage", Role::Voltage, Quantity::Voltage)?]));
+            return Ok(());
+        }
+        channels.extend(cell(self.cell_columns()?));
+        Ok(())
+    }
+
+    /// The columns of the cells by number, from 0 or from 1. The file has as many cells as the configuration.
+    fn cell_columns(&self) -> Result<Vec<Column>, TableError> {
+        let cells = usize::from(self.options.cells);
+        let mut found: Vec<(usize, Known)> =
+            self.known.iter().filter(|of| of.1.role == Role::CellVoltage).copied().collect();
+        found.sort_by_key(|(index, known)| (known.number, *index));
+        found.dedup_by_key(|(_, known)| known.number);
+        let first = found.first().and_then(|(_, known)| known.number).unwrap_or(1);
+        let is_sequence = found.iter().zip(first..).all(|((_, known), n)| known.number == Some(n));
+        if found.len() != cells || first > 1 || !is_sequence {
+            let role = if cells == 1 { "voltage" } else { "voltage{n}" };
+            return Err(match found.len() {
+                0 => self.missing(role, ""),
+                count => self.header.fault(format_args!(
+                    "{count} columns of cell voltages, must be {cells} as in the configuration, numbered from 0 or 1; \
+                     found {}; name them with --column {role}=NAME",
+                    self.header.listed()
+                )),
+            });
+        }
+        let unit = self.format.cell_voltage_unit();
+        Ok(found
+            .into_iter()
+            .map(|of| {
+                let column = self.column(of);
+                match unit.filter(|_| !column.is_stated) {
+                    Some(unit) => Column { unit, is_stated: true, ..column },
+                    None => column,
+                }
+            })
+            .collect())
+    }
+}

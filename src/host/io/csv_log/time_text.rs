@@ -1,0 +1,110 @@
+//! Reads the times of a table: numbers in a unit, durations with colons, or dates.
+
+use crate::io::stamp;
+use crate::io::units::Unit;
+use crate::quantity::Timestamp;
+
+/// Days after which a time of day that begins anew belongs to the next day (ns).
+const DAY_NS: i64 = 86_400_000_000_000;
+
+/// How a table writes times.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum TimeForm {
+    Number,
+    /// A duration or time of day with colons.
+    Clock,
+    Date,
+}
+
+/// Reader of times.
+#[derive(Debug, Clone)]
+pub(super) struct TimeText {
+    /// Unit of numbers.
+    pub(super) unit: &'static Unit,
+    /// Whether the day precedes the month.
+    pub(super) is_day_first: bool,
+    /// Whether a time of day that begins anew belongs to the next day.
+    pub(super) wraps: bool,
+    last_clock: Option<i64>,
+    days: i64,
+}
+
+impl TimeText {
+    pub(super) fn new(unit: &'static Unit) -> Self {
+        Self { unit, is_day_first: false, wraps: true, last_clock: None, days: 0 }
+    }
+
+    /// The form of a text.
+    pub(super) fn form(text: &str) -> TimeForm {
+        let text = text.trim();
+        let Some(colon) = text.find(':') else { return TimeForm::Number };
+        let before = &text[..colon];
+        let is_date = before.contains([' ', 'T']) && before.contains(['-', '/', '.']);
+        if is_date { TimeForm::Date } else { TimeForm::Clock }
+    }
+
+    /// Reads a time. Returns `None` if the text is none.
+    pub(super) fn parse(&mut self, field: &[u8]) -> Option<Timestamp> {
+        let field = field.strip_prefix(b"\"").and_then(|field| field.strip_suffix(b"\"")).unwrap_or(field);
+        let is_seconds = self.unit.nanos() == Some(1_000_000_000);
+        if let Some(time) = is_seconds.then(|| stamp::parse_seconds(field)).flatten() {
+            return is_representable(time).then_some(time);
+        }
+        let text = std::str::from_utf8(field).ok()?;
+        match Self::form(text) {
+            TimeForm::Number => self.number(&text.trim().replace(',', ".")),
+            TimeForm::Clock => self.clock(text),
+            TimeForm::Date => stamp::parse_date(text, self.is_day_first),
+        }
+    }
+
+    fn number(&self, text: &str) -> Option<Timestamp> {
+        let nanos = self.unit.nanos()?;
+        if let Ok(count) = text.parse::<i64>() {
+            return count.checked_mul(nanos).map(Timestamp::from_nanos).filter(|time| is_representable(*time));
+        }
+        let seconds = self.unit.convert(text.parse().ok()?);
+        let time = seconds.is_finite().then(|| Timestamp::from_secs(seconds));
+        time.filter(|time| is_representable(*time))
+    }
+
+    fn clock(&mut self, text: &str) -> Option<Timestamp> {
+        let nanos = stamp::parse_clock(text)?.nanos();
+        let begins_anew = |last: i64| last < DAY_NS && nanos < DAY_NS / 24 && last > DAY_NS - DAY_NS / 24;
+        if self.wraps && self.last_clock.is_some_and(begins_anew) {
+            self.days += 1;
+        }
+        self.last_clock = Some(nanos);
+        Some(Timestamp::from_nanos(nanos + self.days * DAY_NS))
+    }
+}
+
+/// Whether a time is not cut at the ends of the representable range (1677 to 2262).
+fn is_representable(time: Timestamp) -> bool {
+    !matches!(time.nanos(), i64::MIN | i64::MAX) && time.nanos().abs() < i64::MAX - 1
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Times in milliseconds.
+    fn times(unit: &str, texts: &[&str]) -> Vec<Option<i64>> {
+        let mut reader = TimeText::new(Unit::find(unit).expect("known"));
+        texts.iter().map(|text| reader.parse(text.as_bytes()).map(|time| time.nanos() / 1_000_000)).collect()
+    }
+
+    #[test]
+    fn numbers_are_in_their_unit() {
+        assert_eq!(times("min", &["0.5", "1"]), [Some(30_000), Some(60_000)]);
+        assert_eq!(times("ms", &["1700000000123"]), [Some(1_700_000_000_123)]);
+        assert_eq!(times("s", &["1700000000123000"]), [None]);
+        assert_eq!(times("s", &["\"0,5\"", "x", ""]), [Some(500), None, None]);
+    }
+
+    #[test]
+    fn time_of_day_continues_after_midnight() {
+        assert_eq!(times("s", &["23:59:59", "00:00:00"]), [Some(86_399_000), Some(86_400_000)]);
+        assert_eq!(times("s", &["0:59:59", "0:00:00"]), [Some(3_599_000), Some(0)]);
+    }
+}

@@ -1,0 +1,337 @@
+//! Judges whether readings are in the units that they are believed to be in.
+//!
+//! In: times (s), currents (A) and voltages of a cell (V), which may be wrong by a factor. Out: an [`Implausible`] that
+//! names what is wrong and the unit that the values probably have. Readings that no rule contradicts pass: the rules
+//! state what no cell can do, not what a usual cell does. NaN means "no reading".
+
+/// Largest plausible current, as multiple of the capacity per hour.
+const MAX_C_RATE: f64 = 100.0;
+
+/// Largest plausible current if the capacity is unknown (A).
+const MAX_CURRENT_A: f64 = 2000.0;
+
+/// Largest plausible voltage of a cell (V). A module of four cells passes, because some tables call it a cell.
+const MAX_CELL_V: f64 = 20.0;
+
+/// Smallest plausible median voltage of a cell (V).
+const MIN_CELL_V: f64 = 0.1;
+
+/// Smallest and largest plausible product of a cell's resistance and capacity (ohm Ah). Usual cells have 0.02 to 0.5, so
+/// a factor of 1000 in the current is outside.
+const RESISTANCE_CAPACITY: (f64, f64) = (0.000_5, 20.0);
+
+/// Number of current steps that a judgement on the resistance or the sign needs.
+const MIN_STEPS: usize = 10;
+
+/// Share of readings beyond a limit above which a table is in the wrong unit. Fewer are faults of single readings.
+const MAX_SHARE: f64 = 0.01;
+
+/// Largest plausible charge that a cell gives or takes without a return, as multiple of its capacity.
+const MAX_CAPACITIES: f64 = 3.0;
+
+/// Step between rows from which the charge is compared with the capacity (s). A table in milliseconds seems to have
+/// such steps. Shorter steps prove nothing, because a sensor's offset adds up over months.
+const MIN_SLOW_STEP_S: f64 = 50.0;
+
+/// Last plausible date: 2100-01-01 (s since 1970).
+const LAST_DATE_S: f64 = 4_102_444_800.0;
+
+/// Readings that cannot be in the stated unit.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Implausible {
+    /// `time`, `current` or `voltage`.
+    pub quantity: &'static str,
+    /// What was found and why it is impossible.
+    pub what: String,
+    /// Unit that the values probably have, such as `ms` or `mA`.
+    pub probable: Option<&'static str>,
+}
+
+/// What is known of the pack.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct PackSize {
+    /// Capacity of the pack (Ah); `None` = unknown.
+    pub capacity_ah: Option<f64>,
+}
+
+impl PackSize {
+    /// Largest plausible current (A).
+    pub fn max_current_a(&self) -> f64 {
+        self.capacity_ah.map_or(MAX_CURRENT_A, |capacity_ah| MAX_C_RATE * capacity_ah)
+    }
+}
+
+fn implausible(quantity: &'static str, probable: Option<&'static str>, what: String) -> Result<(), Implausible> {
+    Err(Implausible { quantity, what, probable })
+}
+
+/// Unit of a time stamp that is after 2100 if it is read as seconds since 1970: `ms`, `us` or `ns`. `None` = the stamp
+/// may be in seconds.
+pub fn probable_stamp_unit(seconds: f64) -> Option<&'static str> {
+    let units = [(1e3, "ms"), (1e6, "us"), (1e9, "ns")];
+    let is_past = seconds.abs() > LAST_DATE_S;
+    is_past.then(|| units.into_iter().find(|(factor, _)| seconds.abs() / factor <= LAST_DATE_S).map_or("ns", |of| of.1))
+}
+
+/// Unit of times that advance by `step_s` if they are read as seconds, but cannot be seconds.
+fn probable_step_unit(step_s: f64) -> &'static str {
+    // Rows are usually at most 100 s apart.
+    [(1e3, "ms"), (1e6, "us")].into_iter().find(|(factor, _)| step_s / factor <= 100.0).map_or("ns", |of| of.1)
+}
+
+/// Checks the times of rows (s).
+///
+/// # Errors
+/// A time is after 2100.
+pub fn check_dates(time_s: &[f64]) -> Result<(), Implausible> {
+    let Some(late) = time_s.iter().copied().find(|&time_s| probable_stamp_unit(time_s).is_some()) else {
+        return Ok(());
+    };
+    let first = time_s.first().copied().and_then(probable_stamp_unit);
+    let probable = first.unwrap_or_else(|| probable_step_unit(median_step(time_s).unwrap_or_default()));
+    implausible("time", Some(probable), format!("{late} is after the year 2100 as seconds since 1970"))
+}
+
+/// Checks the order of the times of rows (s).
+///
+/// # Errors
+/// More than a fifth of the times are before the time of the previous row.
+pub fn check_order(time_s: &[f64]) -> Result<(), Implausible> {
+    let back = time_s.windows(2).filter(|pair| pair[1] < pair[0]).count();
+    if back * 5 <= time_s.len() {
+        return Ok(());
+    }
+    implausible("time", None, format!("runs backwards in {back} of {} rows", time_s.len()))
+}
+
+/// The median step between times (s).
+fn median_step(time_s: &[f64]) -> Option<f64> {
+    median(&time_s.windows(2).map(|pair| pair[1] - pair[0]).collect::<Vec<_>>())
+}
+
+/// Checks currents (A) against the largest plausible current.
+///
+/// # Errors
+/// More than 1 % of the currents are too large.
+pub fn check_currents(current_a: &[f64], size: PackSize) -> Result<(), Implausible> {
+    let limit_a = size.max_current_a();
+    let Some(largest) = beyond(current_a, limit_a) else { return Ok(()) };
+    let rate = size.capacity_ah.map_or_else(String::new, |capacity_ah| format!(" ({:.0} C)", largest / capacity_ah));
+    implausible("current", Some("mA"), format!("{largest} A{rate} is impossible, at most {limit_a} A"))
+}
+
+/// Checks voltages of a cell (V).
+///
+/// # Errors
+/// The voltages are those of no cell.
+pub fn check_voltages(cell_voltage_v: &[f64]) -> Result<(), Implausible> {
+    if let Some(largest) = beyond(cell_voltage_v, MAX_CELL_V) {
+        let probable = (1000.0..=1000.0 * MAX_CELL_V).contains(&largest).then_some("mV");
+        return implausible("voltage", probable, format!("{largest} V per cell is impossible, at most {MAX_CELL_V} V"));
+    }
+    let Some(median) = median(cell_voltage_v) else { return Ok(()) };
+    if median > 0.0 && median < MIN_CELL_V {
+        let what = format!("half of the readings are below {median} V per cell");
+        return implausible("voltage", None, what);
+    }
+    Ok(())
+}
+
+/// Checks a current by the voltage's answer to its steps, and by the charge that it moves.
+///
+/// # Errors
+/// The current is wrong by a factor, or the times are.
+pub fn check_response(
+    time_s: &[f64],
+    current_a: &[f64],
+    cell_voltage_v: &[f64],
+    size: PackSize,
+) -> Result<(), Implausible> {
+    let Some(capacity_ah) = size.capacity_ah else { return Ok(()) };
+    let all: Vec<(f64, f64)> = steps(current_a, cell_voltage_v).filter(|(_, voltage_v)| *voltage_v != 0.0).collect();
+    let largest = all.iter().fold(0.0_f64, |max, (current_a, _)| max.max(current_a.abs()));
+    let large: Vec<_> =
+        all.iter().filter(|(current_a, _)| *current_a != 0.0 && current_a.abs() >= 0.1 * largest).collect();
+    let falls = large.iter().filter(|(current_a, voltage_v)| current_a * voltage_v < 0.0).count();
+    if large.len() >= MIN_STEPS && falls.max(large.len() - falls) * 10 >= large.len() * 9 {
+        let sum = |term: fn(f64, f64) -> f64| large.iter().map(|&&(i, v)| term(i, v)).sum::<f64>();
+        let resistance_ohm = sum(|i, v| i * v).abs() / sum(|i, _| i * i);
+        let what = format!("the voltage changes by {resistance_ohm:.1e} V per A, impossible for {capacity_ah} Ah");
+        if resistance_ohm * capacity_ah < RESISTANCE_CAPACITY.0 {
+            return implausible("current", Some("mA"), what);
+        }
+        if resistance_ohm * capacity_ah > RESISTANCE_CAPACITY.1 {
+            return implausible("current", Some("A"), what);
+        }
+    }
+    check_charge(time_s, current_a, capacity_ah)
+}
+
+/// Checks that the charge stays within a few capacities, if the steps of time are long.
+fn check_charge(time_s: &[f64], current_a: &[f64], capacity_ah: f64) -> Result<(), Implausible> {
+    let steps_s: Vec<f64> = time_s.windows(2).map(|pair| pair[1] - pair[0]).collect();
+    let Some(step_s) = median(&steps_s).filter(|step_s| *step_s >= MIN_SLOW_STEP_S) else { return Ok(()) };
+    let (mut charge_ah, mut low_ah, mut high_ah) = (0.0_f64, 0.0_f64, 0.0_f64);
+    for (step_s, current_a) in steps_s.iter().zip(current_a) {
+        if *step_s > 0.0 && current_a.is_finite() {
+            charge_ah += current_a * step_s / 3600.0;
+            (low_ah, high_ah) = (low_ah.min(charge_ah), high_ah.max(charge_ah));
+        }
+    }
+    let span_ah = high_ah - low_ah;
+    if span_ah <= MAX_CAPACITIES * capacity_ah {
+        return Ok(());
+    }
+    let what = format!("the current moves {span_ah:.0} Ah, but the capacity is {capacity_ah} Ah");
+    implausible("time", Some(probable_step_unit(step_s)), what)
+}
+
+/// Direction of positive current that the voltage's answers to current steps show.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ShownSign {
+    /// The voltage falls when the current rises.
+    Discharge,
+    /// The voltage rises when the current rises.
+    Charge,
+    /// Both occur often, and the current is never negative: the current is a magnitude.
+    Magnitude,
+    /// Too few or contradictory answers.
+    Unclear,
+}
+
+/// Finds the direction of positive current from the voltage's answers to steps. If the current has few steps, the
+/// stretches of constant current decide: their voltage rises or falls by 100 mV or more. In a load that varies, the
+/// voltage may recover although the cell discharges, so such stretches prove nothing.
+pub fn shown_sign(current_a: &[f64], cell_voltage_v: &[f64]) -> ShownSign {
+    let largest = current_a.iter().copied().filter(|i| i.is_finite()).fold(0.0_f64, |max, i| max.max(i.abs()));
+    let is_never_negative = current_a.iter().all(|&i| i.is_nan() || i >= -0.01 * largest);
+    let mut votes: Vec<bool> = steps(current_a, cell_voltage_v)
+        .filter(|(i, v)| i.abs() >= 0.1 * largest && v.abs() > 0.0005)
+        .map(|(i, v)| i * v < 0.0)
+        .collect();
+    if votes.len() < MIN_STEPS {
+        let plateaus = plateaus(current_a, cell_voltage_v, largest);
+        votes.extend(plateaus.into_iter().flat_map(|is_discharge| [is_discharge; 5]));
+    }
+    let discharge = votes.iter().filter(|&&is_discharge| is_discharge).count();
+    let charge = votes.len() - discharge;
+    let (most, fewest) = (discharge.max(charge), discharge.min(charge));
+    if is_never_negative && fewest >= 5 && fewest * 6 >= most {
+        return ShownSign::Magnitude;
+    }
+    if most < 5 || fewest * 4 > most {
+        return ShownSign::Unclear;
+    }
+    if discharge > charge { ShownSign::Discharge } else { ShownSign::Charge }
+}
+
+/// Changes of current and voltage from row to row.
+fn steps<'a>(current_a: &'a [f64], voltage_v: &'a [f64]) -> impl Iterator<Item = (f64, f64)> + 'a {
+    let pairs = current_a.windows(2).zip(voltage_v.windows(2));
+    pairs.map(|(i, v)| (i[1] - i[0], v[1] - v[0])).filter(|(i, v)| i.is_finite() && v.is_finite())
+}
+
+/// For each stretch of constant current: whether a positive current discharges. The voltage falls at a discharge and
+/// rises at a charge, by 100 mV or more.
+fn plateaus(current_a: &[f64], voltage_v: &[f64], largest: f64) -> Vec<bool> {
+    const MIN_ROWS: usize = 20;
+    const SETTLING_ROWS: usize = 5;
+    let mut votes = Vec::new();
+    let mut start = 0;
+    for end in 1..=current_a.len().min(voltage_v.len()) {
+        let is_constant = current_a.get(end).is_some_and(|i| (i - current_a[start]).abs() <= 0.02 * largest);
+        if is_constant && end < voltage_v.len() {
+            continue;
+        }
+        if end - start >= MIN_ROWS && current_a[start].abs() >= 0.05 * largest && largest > 0.0 {
+            let change_v = voltage_v[end - 1] - voltage_v[start + SETTLING_ROWS];
+            votes.extend((change_v.abs() >= 0.1).then_some(change_v * current_a[start] < 0.0));
+        }
+        start = end;
+    }
+    votes
+}
+
+/// The largest value if more than 1 % of the values are beyond the limit.
+fn beyond(values: &[f64], limit: f64) -> Option<f64> {
+    let known = values.iter().filter(|value| value.is_finite()).count();
+    let count = values.iter().filter(|value| value.abs() > limit).count();
+    let largest = values.iter().filter(|value| value.is_finite()).fold(0.0_f64, |max, value| max.max(value.abs()));
+    (count > 0 && count as f64 > MAX_SHARE * known as f64).then_some(largest)
+}
+
+/// The median of the finite values.
+pub(super) fn median(values: &[f64]) -> Option<f64> {
+    let mut known: Vec<f64> = values.iter().copied().filter(|value| value.is_finite()).collect();
+    let middle = known.len() / 2;
+    (!known.is_empty()).then(|| *known.select_nth_unstable_by(middle, f64::total_cmp).1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SIZE: PackSize = PackSize { capacity_ah: Some(3.0) };
+
+    /// A drive: current (A, positive = discharge) and voltage (V) of a cell of 3 Ah and 30 mohm.
+    fn drive() -> (Vec<f64>, Vec<f64>, Vec<f64>) {
+        let current: Vec<f64> = (0..600).map(|n| 3.0 * (f64::from(n) * 0.7).sin() + 1.0).collect();
+        let mut charge_ah = 0.0;
+        let voltage = current.iter().map(|current_a| {
+            charge_ah += current_a / 3600.0;
+            3.9 - 0.3 * charge_ah - 0.03 * current_a
+        });
+        let voltage = voltage.collect();
+        ((0..600).map(f64::from).collect(), current, voltage)
+    }
+
+    fn scaled(values: &[f64], factor: f64) -> Vec<f64> {
+        values.iter().map(|value| value * factor).collect()
+    }
+
+    #[test]
+    fn wrong_units_are_named_right_ones_pass() {
+        let (time, current, voltage) = drive();
+        let check = |time: &[f64], current: &[f64], voltage: &[f64]| {
+            check_dates(time)?;
+            check_order(time)?;
+            check_voltages(voltage)?;
+            check_currents(current, SIZE)?;
+            check_response(time, current, voltage, SIZE)
+        };
+        let found = |result: Result<(), Implausible>| result.err().map(|of| (of.quantity, of.probable));
+        assert_eq!(found(check(&time, &current, &voltage)), None);
+        assert_eq!(found(check(&time, &scaled(&current, 1000.0), &voltage)), Some(("current", Some("mA"))));
+        // 4 A as 40 C: only the voltage's answer shows it.
+        assert_eq!(
+            found(check_response(&time, &scaled(&current, 1000.0), &voltage, SIZE)),
+            Some(("current", Some("mA")))
+        );
+        assert_eq!(found(check(&time, &scaled(&current, 0.001), &voltage)), Some(("current", Some("A"))));
+        assert_eq!(found(check(&time, &current, &scaled(&voltage, 1000.0))), Some(("voltage", Some("mV"))));
+        assert_eq!(found(check(&time, &current, &scaled(&voltage, 0.001))), Some(("voltage", None)));
+        assert_eq!(found(check(&scaled(&time, 1000.0), &current, &voltage)), Some(("time", Some("ms"))));
+        let backwards: Vec<f64> = time.iter().rev().copied().collect();
+        assert_eq!(found(check(&backwards, &current, &voltage)), Some(("time", None)));
+        for (factor, unit) in [(1e3, "ms"), (1e6, "us"), (1e9, "ns")] {
+            let stamps: Vec<f64> = time.iter().map(|time| (1.7e9 + time) * factor).collect();
+            assert_eq!(found(check(&stamps, &current, &voltage)), Some(("time", Some(unit))));
+        }
+    }
+
+    #[test]
+    fn sign_and_magnitude_are_shown_by_steps() {
+        let (_, current, voltage) = drive();
+        assert_eq!(shown_sign(&current, &voltage), ShownSign::Discharge);
+        assert_eq!(shown_sign(&scaled(&current, -1.0), &voltage), ShownSign::Charge);
+        let magnitude: Vec<f64> = current.iter().map(|value| value.abs()).collect();
+        assert_eq!(shown_sign(&magnitude, &voltage), ShownSign::Magnitude);
+        assert_eq!(shown_sign(&current, &[3.7; 600]), ShownSign::Unclear);
+        // Constant currents: a charge and a discharge in a file without a sign.
+        let constant = vec![1.0; 200];
+        let swing: Vec<f64> = (0..200).map(|n| 3.5 + 0.005 * f64::from(100 - (n - 100_i32).abs())).collect();
+        assert_eq!(shown_sign(&constant, &swing[..100]), ShownSign::Charge);
+        let two: Vec<f64> = constant[..98].iter().chain(&[0.0, 0.0]).chain(&constant[..100]).copied().collect();
+        assert_eq!(shown_sign(&two, &swing), ShownSign::Magnitude);
+    }
+}

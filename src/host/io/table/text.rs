@@ -1,0 +1,169 @@
+//! Finds the form of a text table: encoding, separator, and the line of the header.
+//!
+//! In: the source. Out: its first megabyte as UTF-8, the rest as a reader, and the [`Form`]. A failed read is reported
+//! after the bytes before it.
+
+use std::io::{self, Cursor, Read};
+
+/// Largest number of bytes that are examined before the first row is returned: one row of the greatest length.
+const HEAD_BYTES: usize = super::MAX_ROW_BYTES;
+
+/// Largest number of lines before the header. The largest known preamble (EC-Lab with many techniques) has some
+/// hundred lines.
+const MAX_PREAMBLE_LINES: usize = 1000;
+
+/// Separators in the order of preference.
+const SEPARATORS: [u8; 4] = *b",;\t|";
+
+/// The beginning of a table.
+pub(super) struct Head {
+    /// The first bytes as UTF-8, without a byte order mark.
+    pub(super) bytes: Vec<u8>,
+    /// The bytes after the head.
+    pub(super) rest: Box<dyn Read>,
+    /// Whether the head is the whole table.
+    pub(super) is_whole: bool,
+}
+
+impl Head {
+    /// Reads the beginning of `source`.
+    pub(super) fn read(source: Box<dyn Read>) -> Self {
+        let mut source = source;
+        let mut mark = Vec::new();
+        if let Err(error) = source.by_ref().take(4).read_to_end(&mut mark) {
+            return Self { bytes: Vec::new(), rest: Box::new(FailedRead(Some(error))), is_whole: false };
+        }
+        let little = mark.starts_with(&[0xFF, 0xFE]) || matches!(mark[..], [1..=0x7F, 0, 1..=0x7F, 0]);
+        let big = mark.starts_with(&[0xFE, 0xFF]) || matches!(mark[..], [0, 1..=0x7F, 0, 1..=0x7F]);
+        let whole: Box<dyn Read> = Box::new(Cursor::new(mark).chain(source));
+        let mut text: Box<dyn Read> = if little || big {
+            Box::new(Utf16 { source: io::BufReader::new(whole), little, pending: None })
+        } else {
+            whole
+        };
+        let mut bytes = Vec::new();
+        let result = text.by_ref().take(HEAD_BYTES as u64 + 1).read_to_end(&mut bytes);
+        if bytes.starts_with("\u{feff}".as_bytes()) {
+            bytes.drain(..3);
+        }
+        match result {
+            Ok(_) => {
+                let is_whole = bytes.len() < HEAD_BYTES - 3;
+                Self { bytes, rest: text, is_whole }
+            }
+            Err(error) => Self { bytes, rest: Box::new(FailedRead(Some(error))), is_whole: false },
+        }
+    }
+}
+
+/// A source that fails once.
+struct FailedRead(Option<io::Error>);
+
+impl Read for FailedRead {
+    fn read(&mut self, _: &mut [u8]) -> io::Result<usize> {
+        self.0.take().map_or(Ok(0), Err)
+    }
+}
+
+/// Converts UTF-16 to UTF-8.
+struct Utf16 {
+    source: io::BufReader<Box<dyn Read>>,
+    little: bool,
+    /// First half of a surrogate pair.
+    pending: Option<u16>,
+}
+
+impl Utf16 {
+    /// The next character; `None` at the end.
+    fn next_char(&mut self) -> io::Result<Option<char>> {
+        loop {
+            let mut pair = [0; 2];
+            match self.source.read_exact(&mut pair) {
+                Err(error) if error.kind() == io::ErrorKind::UnexpectedEof => {
+                    return Ok(self.pending.take().map(|_| char::REPLACEMENT_CHARACTER));
+                }
+                result => result?,
+            }
+            let unit = if self.little { u16::from_le_bytes(pair) } else { u16::from_be_bytes(pair) };
+            if self.pending.is_none() && (0xD800..0xDC00).contains(&unit) {
+                self.pending = Some(unit);
+                continue;
+            }
+            let units = self.pending.take().into_iter().chain([unit]);
+            return Ok(Some(char::decode_utf16(units).next().and_then(Result::ok).unwrap_or('\u{fffd}')));
+        }
+    }
+}
+
+impl Read for Utf16 {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        let mut count = 0;
+        while buffer.len() - count >= 4 {
+            let Some(character) = self.next_char()? else { break };
+            count += character.encode_utf8(&mut buffer[count..]).len();
+        }
+        Ok(count)
+    }
+}
+
+/// Form of a text table.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Form {
+    /// Separator of fields.
+    pub(super) separator: u8,
+    /// Offset of the header line in the head.
+    pub(super) start: usize,
+    /// Whether the score has found the header.
+    pub(super) is_known: bool,
+}
+
+/// Finds the header line. `score` rates the fields of a line: 0 = no header, else higher = more known columns. If no
+/// line is a header, the first line is.
+pub(super) fn form(head: &[u8], score: &dyn Fn(&[String]) -> usize) -> Form {
+    let mut start = 0;
+    let mut first = None;
+    let mut announced = None;
+    for number in 1..=MAX_PREAMBLE_LINES {
+        let Some(rest) = head.get(start..).filter(|rest| !rest.is_empty()) else { break };
+        let len = memchr::memchr2(b'\n', b'\r', rest).unwrap_or(rest.len());
+        let line = &rest[..len];
+        if let [b's', b'e', b'p', b'=', separator] = line.to_ascii_lowercase()[..]
+            && number == 1
+        {
+            first = Some(Form { separator, start: len + 1, is_known: false });
+        } else {
+            first = first.or_else(|| Some(Form { separator: most_frequent(line), start, is_known: false }));
+            let rated = SEPARATORS.iter().filter(|separator| line.contains(separator)).map(|&separator| {
+                let fields = split(line, separator);
+                (score(&fields), separator)
+            });
+            // Of equal scores the first separator counts.
+            let best = rated.rev().max_by_key(|&(score, _)| score);
+            if let Some((_, separator)) = best.filter(|&(score, _)| score > 0 || announced == Some(number)) {
+                return Form { separator, start, is_known: true };
+            }
+        }
+        announced = announced.or_else(|| announced_header(line));
+        let is_pair = rest[len..].starts_with(b"\r\n");
+        start += len + if is_pair { 2 } else { 1 };
+    }
+    first.unwrap_or(Form { separator: b',', start: 0, is_known: false })
+}
+
+/// Line number of the header that a line of an EC-Lab preamble states: `Nb header lines : 98`.
+fn announced_header(line: &[u8]) -> Option<usize> {
+    let text = String::from_utf8_lossy(line);
+    text.trim().strip_prefix("Nb header lines")?.trim_start_matches([' ', ':', '\t']).trim().parse().ok()
+}
+
+/// The separator that occurs most often in a line.
+fn most_frequent(line: &[u8]) -> u8 {
+    let count = |separator: u8| line.iter().filter(|&&byte| byte == separator).count();
+    SEPARATORS.into_iter().rev().max_by_key(|&separator| count(separator)).unwrap_or(b',')
+}
+
+/// Splits a line that may be a header. Quotes around a field are removed.
+fn split(line: &[u8], separator: u8) -> Vec<String> {
+    let fields = line.split(|&byte| byte == separator);
+    fields.map(|field| String::from_utf8_lossy(field).trim().trim_matches('"').to_owned()).collect()
+}

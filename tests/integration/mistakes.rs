@@ -1,0 +1,360 @@
+//! Makes the wiring faults that people make, one at a time, in right configurations. `packwatch doctor` must name each
+//! fault in words, and must find nothing wrong in the right configurations.
+//!
+//! The packs: 4 LFP cells with single voltages and 96 NMC cells with a total voltage, both simulated over a discharge and
+//! a charge, with a state of charge, a state of health, a cycle counter and a MOSFET temperature on the bus; and, if the
+//! measured data are present, a boat (16 LFP cells), a Kona (total voltage) and other cars.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::LazyLock;
+
+use assert_cmd::Command;
+
+use crate::support::measured;
+
+const DBC: &str = r#"VERSION ""
+NS_ :
+BS_:
+BU_: BMS
+BO_ 256 BmsStatus: 8 BMS
+ SG_ Current : 0|16@1- (0.1,0) [-1000|1000] "A" X
+ SG_ PackVoltage : 16|16@1+ (0.01,0) [0|655] "V" X
+BO_ 257 BmsTemps: 8 BMS
+ SG_ CellTemp : 0|16@1+ (0.1,0) [0|500] "K" X
+ SG_ TempMos : 16|16@1+ (0.1,0) [0|500] "K" X
+BO_ 258 BmsSummary: 8 BMS
+ SG_ SOC : 0|16@1+ (0.1,0) [0|100] "%" X
+ SG_ SOH : 16|8@1+ (1,0) [0|100] "%" X
+ SG_ Cycles : 24|16@1+ (1,0) [0|65535] "" X
+BO_ 272 BmsCells: 8 BMS
+ SG_ Cell1 : 0|16@1+ (1,0) [0|5000] "mV" X
+ SG_ Cell2 : 16|16@1+ (1,0) [0|5000] "mV" X
+ SG_ Cell3 : 32|16@1+ (1,0) [0|5000] "mV" X
+ SG_ Cell4 : 48|16@1+ (1,0) [0|5000] "mV" X
+"#;
+
+const CELLS: &str = r#"[pack]
+cells = 4
+chemistry = "lfp-graphite"
+rated_capacity_ah = 100
+
+[[interface]]
+name = "can0"
+
+[input]
+dbc = ["pack.dbc"]
+
+[input.current]
+signal = "BmsStatus.Current"
+positive = "charge"
+
+[input.cell_voltage]
+signal = "BmsCells.Cell{n}"
+scale = 0.001
+
+[[input.temperature]]
+signal = "BmsTemps.CellTemp"
+offset = -273.15
+
+[input.reported_soc]
+signal = "BmsSummary.SOC"
+
+[input.reported_soh]
+signal = "BmsSummary.SOH"
+
+[limits.current]
+max_age_s = 3.0
+
+[limits.voltage]
+max_age_s = 4.0
+"#;
+
+/// The pack with a total voltage.
+fn total() -> String {
+    let edits = [
+        ("lfp-graphite", "nmc-graphite"),
+        ("cells = 4", "cells = 96"),
+        ("[input.cell_voltage]", "[input.pack_voltage]"),
+        ("BmsCells.Cell{n}", "BmsStatus.PackVoltage"),
+        ("scale = 0.001\n", ""),
+    ];
+    edits.iter().fold(CELLS.to_owned(), |text, (from, to)| text.replace(from, to))
+}
+
+/// A pack: the files of its folder, its right configuration and its log.
+#[derive(Debug, Clone)]
+struct Pack {
+    files: BTreeMap<String, String>,
+    config: String,
+    log: PathBuf,
+    arguments: &'static [&'static str],
+}
+
+impl Pack {
+    /// Runs the doctor with an edited configuration. Returns the exit code and the words of its output.
+    fn doctor(&self, edits: &[(&str, &str)]) -> (i32, String) {
+        let folder = tempfile::tempdir().unwrap();
+        let (mut config, mut files) = (self.config.clone(), self.files.clone());
+        for (from, to) in edits {
+            let mut is_found = false;
+            for text in files.values_mut().chain([&mut config]) {
+                is_found |= text.contains(from);
+                *text = text.replace(from, to);
+            }
+            assert!(is_found, "no text {from}");
+        }
+        for (name, text) in &files {
+            std::fs::write(folder.path().join(name), text).unwrap();
+        }
+        std::fs::write(folder.path().join("pack.toml"), config).unwrap();
+        let mut command = Command::cargo_bin("packwatch").unwrap();
+        let command = command.arg("doctor").arg("-c").arg(folder.path().join("pack.toml"));
+        let output = command.arg(&self.log).args(self.arguments).output().unwrap();
+        let text = String::from_utf8([output.stdout, output.stderr].concat()).unwrap();
+        (output.status.code().unwrap(), text.split_whitespace().collect::<Vec<_>>().join(" "))
+    }
+}
+
+static FOLDER: LazyLock<tempfile::TempDir> = LazyLock::new(|| tempfile::tempdir().unwrap());
+static LFP: LazyLock<Pack> = LazyLock::new(|| simulated("cells", CELLS.to_owned()));
+static NMC: LazyLock<Pack> = LazyLock::new(|| simulated("total", total()));
+
+/// Simulates a pack and adds the values that its controller reports.
+fn simulated(name: &str, config: String) -> Pack {
+    let folder = FOLDER.path();
+    std::fs::write(folder.join("pack.dbc"), DBC).unwrap();
+    let [toml, log, truth] = ["toml", "raw", "csv"].map(|extension| folder.join(format!("{name}.{extension}")));
+    std::fs::write(&toml, &config).unwrap();
+    let mut command = Command::cargo_bin("packwatch").unwrap();
+    command.args(["simulate", "reference", "--duration", "14000", "--truth-period", "10", "-c"]).arg(&toml);
+    command.arg("-o").arg(&log).arg("--truth").arg(&truth).assert().success();
+    let text = std::fs::read_to_string(&truth).unwrap();
+    let number = |text: &str| text.parse::<f64>().unwrap();
+    let row = |line: &str| {
+        let fields: Vec<&str> = line.split(',').collect();
+        (fields[1] == "0").then(|| (number(fields[0]), number(fields[2])))
+    };
+    let socs: Vec<(f64, f64)> = text.lines().skip(1).filter_map(row).collect();
+    let mut lines = String::new();
+    for line in std::fs::read_to_string(&log).unwrap().lines() {
+        lines += &reported(line, &socs);
+    }
+    let log = folder.join(format!("{name}.log"));
+    std::fs::write(&log, lines).unwrap();
+    Pack { files: BTreeMap::from([("pack.dbc".to_owned(), DBC.to_owned())]), config, log, arguments: &[] }
+}
+
+/// The line; after a temperature, also the reported values.
+fn reported(line: &str, socs: &[(f64, f64)]) -> String {
+    let (stamp, frame) = line.split_once(" can0 ").unwrap();
+    let Some(data) = frame.strip_prefix("101#") else { return format!("{line}\n") };
+    let time = stamp.trim_matches(['(', ')']).parse::<f64>().unwrap();
+    let at = socs.partition_point(|(at, _)| *at <= time).max(1);
+    let code = |value: f64| (value as u16).to_le_bytes().map(|byte| format!("{byte:02X}")).concat();
+    let kelvin = u16::from_str_radix(&data[..2], 16).unwrap() + 256 * u16::from_str_radix(&data[2..4], 16).unwrap();
+    let warm = code(f64::from(kelvin) + 140.0);
+    let summary = format!("{}60{}000000", code((1000.0 * socs[at - 1].1).round()), code(131.0));
+    format!("{stamp} can0 101#{}{warm}00000000\n{stamp} can0 102#{summary}\n", &data[..4])
+}
+
+/// A mistake: its number in the list of mistakes, the edits that make it, and words that name it.
+type Mistake = (&'static str, &'static [(&'static str, &'static str)], &'static [&'static str]);
+
+const OF_CELLS: &[Mistake] = &[
+    ("1", &[("\"charge\"", "\"discharge\"")], &["sign of the current is inverted", "+ positive = \"charge\""]),
+    ("2, fewer", &[("cells = 4", "cells = 3")], &["the pack has 4 cells, 3 are configured"]),
+    ("2, more", &[("cells = 4", "cells = 5")], &["cells 5"]),
+    ("5", &[("BmsStatus.Current", "BmsStatus.PackVoltage")], &["pack current is read from a voltage"]),
+    ("6", &[("BmsStatus.Current", "BmsSummary.Cycles")], &["pack current: the value never changes"]),
+    (
+        "7",
+        &[("BmsSummary.SOC", "X"), ("BmsSummary.SOH", "BmsSummary.SOC"), ("\"X\"", "\"BmsSummary.SOH\"")],
+        &["reported SOC and reported SOH are exchanged", "+ signal = \"BmsSummary.SOC\""],
+    ),
+    (
+        "8",
+        &[("BmsTemps.CellTemp", "BmsTemps.TempMos")],
+        &["not a temperature of the cells", "+ signal = \"BmsTemps.CellTemp\""],
+    ),
+    ("9, no scale", &[("scale = 0.001\n", "")], &["off by a factor of 1000"]),
+    ("9, wrong scale", &[("scale = 0.001", "scale = 0.01")], &["off by a factor of 10"]),
+    ("10, tenth", &[("\"charge\"", "\"charge\"\nscale = 0.1")], &["pack current: off by a factor of"]),
+    ("10, half", &[("\"charge\"", "\"charge\"\nscale = 0.5")], &["pack current: off by a factor of 2"]),
+    ("11", &[("16@1", "16@0")], &["wrong byte order"]),
+    ("12, tenth", &[("ah = 100", "ah = 10")], &["10 Ah are configured", "+ rated_capacity_ah = "]),
+    ("12, third", &[("ah = 100", "ah = 36")], &["36 Ah are configured", "+ rated_capacity_ah = "]),
+    ("12, tenfold", &[("ah = 100", "ah = 1000")], &["1000 Ah are configured", "+ rated_capacity_ah = "]),
+    ("13", &[("lfp-graphite", "nmc-graphite")], &["chemistry contradicts the reported SOC", "+ chemistry = \"lfp-graphite\""]),
+    ("15", &[("\"can0\"", "\"can1\"")], &["can0"]),
+    ("16", &[("\"pack.dbc\"", "\"pak.dbc\"")], &["pack.toml:10: input.dbc", "did you mean pack.dbc"]),
+    ("17", &[("cells = 4", "cells = 4\ncells = 6")], &["pack.toml:3", "the key cells is set twice, first in line 2"]),
+    ("18", &[("offset = -273.15\n", "")], &["temperatures"]),
+];
+
+const OF_TOTAL: &[Mistake] = &[
+    ("1", &[("\"charge\"", "\"discharge\"")], &["sign of the current is inverted"]),
+    ("3", &[("cells = 96", "cells = 49")], &["49 cells cannot have this pack voltage"]),
+    ("4, fewer", &[("cells = 96", "cells = 86")], &["number of cells", "contradicts the reported SOC"]),
+    ("4, more", &[("cells = 96", "cells = 108")], &["number of cells", "contradicts the reported SOC"]),
+    ("14", &[("nmc-graphite", "lfp-graphite")], &["chemistry", "+ chemistry = \"nmc-graphite\""]),
+];
+
+/// Tries the mistakes of a pack. Returns those that are not named.
+fn unnamed(name: &str, pack: &Pack, mistakes: &[Mistake]) -> Vec<String> {
+    let (code, text) = pack.doctor(&[]);
+    let mut failed = Vec::new();
+    if code != 0 || !text.contains("No faults found") {
+        failed.push(format!("{name}, right configuration: {text}"));
+    }
+    for (number, edits, words) in mistakes {
+        let (code, text) = pack.doctor(edits);
+        if code == 0 || !words.iter().all(|words| text.contains(words)) {
+            failed.push(format!("{name}, mistake {number}: {text}"));
+        }
+    }
+    failed
+}
+
+#[test]
+fn simulated_mistakes_are_named_and_right_packs_silent() {
+    let mut failed = unnamed("LFP, cells", &LFP, OF_CELLS);
+    failed.extend(unnamed("NMC, total", &NMC, OF_TOTAL));
+    assert!(failed.is_empty(), "{}", failed.join("\n\n"));
+}
+
+#[test]
+fn hole_in_log_is_named_with_its_times() {
+    // 2 h of the log, or of the current alone, are missing.
+    for (is_whole, words) in [(true, "a stretch of 2 h is missing in the log"), (false, "pack current: no reading for")] {
+        let mut pack = LFP.clone();
+        let text = std::fs::read_to_string(&pack.log).unwrap();
+        let is_kept = |line: &&str| {
+            let time = line[1..11].parse::<i64>().unwrap() - 1_700_000_000;
+            !(2000..9200).contains(&time) || !is_whole && !line.contains(" 100#")
+        };
+        pack.log = FOLDER.path().join(format!("hole{is_whole}.log"));
+        std::fs::write(&pack.log, text.lines().filter(is_kept).map(|line| format!("{line}\n")).collect::<String>()).unwrap();
+        let (code, text) = pack.doctor(&[]);
+        assert!(code == 1 && text.contains(words) && text.contains("from 19"), "{text}");
+    }
+}
+
+#[test]
+fn current_without_sign_is_named() {
+    let mut pack = LFP.clone();
+    let text = std::fs::read_to_string(&pack.log).unwrap();
+    let magnitude = |line: &str| {
+        let Some((before, data)) = line.split_once("100#") else { return format!("{line}\n") };
+        let low = u16::from_str_radix(&data[..2], 16).unwrap() + 256 * u16::from_str_radix(&data[2..4], 16).unwrap();
+        let bytes = low.cast_signed().unsigned_abs().to_le_bytes();
+        format!("{before}100#{:02X}{:02X}{}\n", bytes[0], bytes[1], &data[4..])
+    };
+    pack.log = FOLDER.path().join("magnitude.log");
+    std::fs::write(&pack.log, text.lines().map(magnitude).collect::<String>()).unwrap();
+    let (code, text) = pack.doctor(&[("\"charge\"", "\"discharge\"")]);
+    assert!(code == 1 && text.contains("the current is never negative, but the"), "{text}");
+}
+
+/// A folder of further measured data, beside the folder of measured data.
+fn more_data(name: &str) -> PathBuf {
+    measured::path("can_ev").join("../../more-data").join(name)
+}
+
+const OF_BOAT: &[Mistake] = &[
+    ("1", &[("\"charge\"", "\"discharge\"")], &["sign of the current is inverted"]),
+    ("2, fewer", &[("cells = 16", "cells = 15")], &["the pack has 16 cells, 15 are configured"]),
+    ("6", &[("BMS_Status.Current", "BMS_Status.Cycles")], &["pack current: the value never changes"]),
+    (
+        "7",
+        &[("BMS_Status.SOC", "X"), ("BMS_MinMax.SOH", "BMS_Status.SOC"), ("\"X\"", "\"BMS_MinMax.SOH\"")],
+        &["reported SOC and reported SOH are exchanged"],
+    ),
+    ("8", &[("BMS_Temps.Temp_1", "BMS_Temps.TempMos")], &["not a temperature of the cells"]),
+    ("12, tenth", &[("ah = 280", "ah = 28")], &["28 Ah are configured", "+ rated_capacity_ah = "]),
+    ("12, third", &[("ah = 280", "ah = 100")], &["100 Ah are configured", "+ rated_capacity_ah = "]),
+    ("12, tenfold", &[("ah = 280", "ah = 2800")], &["2800 Ah are configured", "+ rated_capacity_ah = "]),
+    ("13", &[("lfp-graphite", "nmc-graphite")], &["chemistry contradicts the reported SOC", "+ chemistry = \"lfp-graphite\""]),
+    ("16", &[("\"boat.dbc\"", "\"bot.dbc\"")], &["input.dbc", "did you mean boat.dbc"]),
+];
+
+const KONA: &str = r#"[pack]
+cells = 98
+chemistry = "nmc-graphite"
+rated_capacity_ah = 180
+
+[[interface]]
+name = "can0"
+
+[[interface]]
+name = "can1"
+
+[input]
+dbc = ["kona.dbc"]
+
+[input.current]
+signal = "Batt_HV_Status.IBatt"
+interface = "can0"
+positive = "discharge"
+
+[input.pack_voltage]
+signal = "Batt_HV_Status.VBatt"
+interface = "can0"
+
+[[input.temperature]]
+signal = "BatteryCharging.uwe596_7_TAkkuH"
+interface = "can0"
+
+[input.reported_soc]
+signal = "BatteryLimits.SoC_Maybe"
+interface = "can0"
+"#;
+
+const OF_KONA: &[Mistake] = &[
+    ("3", &[("cells = 98", "cells = 49")], &["49 cells cannot have this pack voltage"]),
+    ("4, fewer", &[("cells = 98", "cells = 90")], &["number of cells", "contradicts the reported SOC"]),
+    ("4, more", &[("cells = 98", "cells = 108")], &["number of cells", "contradicts the reported SOC"]),
+    ("14", &[("nmc-graphite", "lfp-graphite")], &["chemistry", "+ chemistry = \"nmc-graphite\""]),
+    ("16", &[("\"kona.dbc\"", "\"dbc/kona.dbc\"")], &["input.dbc", "did you mean kona.dbc"]),
+];
+
+fn read(path: &Path) -> String {
+    std::fs::read_to_string(path).unwrap()
+}
+
+fn boat() -> Pack {
+    let folder = more_data("field/boat");
+    let files = ["boat.dbc", "boat_cell.toml", "eve.toml"].map(|name| (name.to_owned(), read(&folder.join(name))));
+    let config = read(&folder.join("label.toml"));
+    let converted = "signal = \"BMS_Temps.Temp_1\"\noffset = -273.15\n";
+    let config = match config.contains("offset") {
+        true => config,
+        false => config.replace("signal = \"BMS_Temps.Temp_1\"", converted) + "\n[limits.temperature]\nmax_age_s = 15\n",
+    };
+    Pack { files: files.into(), config, log: folder.join("boat.log.gz"), arguments: &["--for", "30000"] }
+}
+
+#[test]
+#[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
+fn measured_mistakes_are_named_and_right_packs_silent() {
+    if !more_data("field/boat").is_dir() {
+        eprintln!("skipped: no folder more-data next to the measured data");
+        return;
+    }
+    let boat = boat();
+    let mut failed = unnamed("boat", &boat, OF_BOAT);
+    let label = "chemistry = \"lfp-graphite\"\nrated_capacity_ah = 280";
+    for model in ["boat_cell.toml", "eve.toml"] {
+        let pack = Pack { config: boat.config.replace(label, &format!("cell_model = {model:?}")), ..boat.clone() };
+        failed.extend(unnamed(model, &pack, &[]));
+    }
+    let can = measured::path("can_ev");
+    let kona = Pack {
+        files: BTreeMap::from([("kona.dbc".to_owned(), read(&can.join("kona_pcan.dbc")))]),
+        config: KONA.to_owned(),
+        log: can.join("kona2019_power_cycle_pcan_can0_ccan_can1.log.gz"),
+        arguments: &[],
+    };
+    failed.extend(unnamed("Kona", &kona, OF_KONA));
+    assert!(failed.is_empty(), "{}", failed.join("\n\n"));
+}
