@@ -87,22 +87,13 @@ impl Format {
     /// Fails if the source cannot be read or its header is damaged.
     pub fn open(self, source: Source) -> io::Result<Box<dyn LogReader>> {
         match self {
-            // Text formats.
-            Self::Candump
-            | Self::CandumpDeltas
-            | Self::Asc
-            | Self::Trc
-            | Self::Gvret
-            | Self::PythonCanCsv
-            | Self::Css
-            | Self::Crtd
-            | Self::CanKing
-            | Self::Busmaster => text::open(self, source.reader),
             // Binary formats.
             Self::Blf => Ok(Box::new(BlfReader::open(source)?)),
             Self::Mf4 => Ok(Box::new(Mf4Reader::open(source)?)),
             Self::Pcap => Ok(Box::new(PcapReader::open(source)?)),
             Self::PcapNg => Ok(Box::new(PcapNgReader::open(source))),
+            // Text formats.
+            text => text::open(text, source.reader),
         }
     }
 

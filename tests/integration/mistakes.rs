@@ -185,7 +185,11 @@ const OF_CELLS: &[Mistake] = &[
     ("12, tenth", &[("ah = 100", "ah = 10")], &["10 Ah are configured", "+ rated_capacity_ah = "]),
     ("12, third", &[("ah = 100", "ah = 36")], &["36 Ah are configured", "+ rated_capacity_ah = "]),
     ("12, tenfold", &[("ah = 100", "ah = 1000")], &["1000 Ah are configured", "+ rated_capacity_ah = "]),
-    ("13", &[("lfp-graphite", "nmc-graphite")], &["chemistry contradicts the reported SOC", "+ chemistry = \"lfp-graphite\""]),
+    (
+        "13",
+        &[("lfp-graphite", "nmc-graphite")],
+        &["chemistry contradicts the reported SOC", "+ chemistry = \"lfp-graphite\""],
+    ),
     ("15", &[("\"can0\"", "\"can1\"")], &["can0"]),
     ("16", &[("\"pack.dbc\"", "\"pak.dbc\"")], &["pack.toml:10: input.dbc", "did you mean pack.dbc"]),
     ("17", &[("cells = 4", "cells = 4\ncells = 6")], &["pack.toml:3", "the key cells is set twice, first in line 2"]),
@@ -226,7 +230,8 @@ fn simulated_mistakes_are_named_and_right_packs_silent() {
 #[test]
 fn hole_in_log_is_named_with_its_times() {
     // 2 h of the log, or of the current alone, are missing.
-    for (is_whole, words) in [(true, "a stretch of 2 h is missing in the log"), (false, "pack current: no reading for")] {
+    for (is_whole, words) in [(true, "a stretch of 2 h is missing in the log"), (false, "pack current: no reading for")]
+    {
         let mut pack = LFP.clone();
         let text = std::fs::read_to_string(&pack.log).unwrap();
         let is_kept = |line: &&str| {
@@ -234,7 +239,8 @@ fn hole_in_log_is_named_with_its_times() {
             !(2000..9200).contains(&time) || !is_whole && !line.contains(" 100#")
         };
         pack.log = FOLDER.path().join(format!("hole{is_whole}.log"));
-        std::fs::write(&pack.log, text.lines().filter(is_kept).map(|line| format!("{line}\n")).collect::<String>()).unwrap();
+        std::fs::write(&pack.log, text.lines().filter(is_kept).map(|line| format!("{line}\n")).collect::<String>())
+            .unwrap();
         let (code, text) = pack.doctor(&[]);
         assert!(code == 1 && text.contains(words) && text.contains("from 19"), "{text}");
     }
@@ -274,7 +280,11 @@ const OF_BOAT: &[Mistake] = &[
     ("12, tenth", &[("ah = 280", "ah = 28")], &["28 Ah are configured", "+ rated_capacity_ah = "]),
     ("12, third", &[("ah = 280", "ah = 100")], &["100 Ah are configured", "+ rated_capacity_ah = "]),
     ("12, tenfold", &[("ah = 280", "ah = 2800")], &["2800 Ah are configured", "+ rated_capacity_ah = "]),
-    ("13", &[("lfp-graphite", "nmc-graphite")], &["chemistry contradicts the reported SOC", "+ chemistry = \"lfp-graphite\""]),
+    (
+        "13",
+        &[("lfp-graphite", "nmc-graphite")],
+        &["chemistry contradicts the reported SOC", "+ chemistry = \"lfp-graphite\""],
+    ),
     ("16", &[("\"boat.dbc\"", "\"bot.dbc\"")], &["input.dbc", "did you mean boat.dbc"]),
 ];
 
@@ -329,7 +339,9 @@ fn boat() -> Pack {
     let converted = "signal = \"BMS_Temps.Temp_1\"\noffset = -273.15\n";
     let config = match config.contains("offset") {
         true => config,
-        false => config.replace("signal = \"BMS_Temps.Temp_1\"", converted) + "\n[limits.temperature]\nmax_age_s = 15\n",
+        false => {
+            config.replace("signal = \"BMS_Temps.Temp_1\"", converted) + "\n[limits.temperature]\nmax_age_s = 15\n"
+        }
     };
     Pack { files: files.into(), config, log: folder.join("boat.log.gz"), arguments: &["--for", "30000"] }
 }

@@ -178,7 +178,8 @@ impl Writer<'_> {
             if let Some(soc) = self.best(PackQuantity::Soc) {
                 let ocv_v = |soc: f64| model.ocv_v(&model.grid_position(soc.clamp(0.0, 1.0), 25.0));
                 // Under load, the voltage differs from the open-circuit voltage.
-                (low_v, high_v) = (ocv_v(soc.low / 100.0 - HIDDEN_SOC) - 0.05, ocv_v(soc.high / 100.0 + HIDDEN_SOC) + 0.05);
+                (low_v, high_v) =
+                    (ocv_v(soc.low / 100.0 - HIDDEN_SOC) - 0.05, ocv_v(soc.high / 100.0 + HIDDEN_SOC) + 0.05);
             }
         }
         ((pack.high / high_v).ceil() as u32, (pack.low / low_v).floor() as u32)

@@ -212,7 +212,8 @@ fn current(judge: &mut Judge<'_>) {
 /// Reports a current that never comes near zero because its offset is missing.
 fn missing_offset(judge: &mut Judge<'_>, (signal, series): &SignalSeries<'_>) -> bool {
     let (sign, factor) = (signal.binding.scale.signum(), (signal.layout.factor * signal.scale).abs());
-    let on_bus = Series::of(series.values.kept().iter().zip(0_u32..).map(|(value, n)| (f64::from(n), Ok(sign * value))));
+    let on_bus =
+        Series::of(series.values.kept().iter().zip(0_u32..).map(|(value, n)| (f64::from(n), Ok(sign * value))));
     let (low, high) = (on_bus.extent.min, on_bus.extent.max);
     let Some(zero) = on_bus.zero_code(factor).filter(|zero| low > STEADY_A && *zero != 0.0) else { return false };
     judge.is_mixed_up = true;
