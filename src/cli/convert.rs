@@ -160,13 +160,7 @@ fn options(args: &Args, config: Option<&Config>) -> LogOptions {
             interfaces: Vec::new(),
             channels: args.input.channels.clone(),
             strict: args.input.strict,
-            csv: CsvOptions {
-                columns: args.input.columns.clone(),
-                charge_positive: false,
-                start_times: None,
-                cells: 1,
-                pack_total: true,
-            },
+            csv: CsvOptions { cells: 1, series: 1, pack_total: true, ..CsvOptions::default() },
             encode_row: Box::new(|_, _| 0),
         },
     }
