@@ -134,21 +134,24 @@ impl Containers {
         loop {
             let held = self.file.fill(1)?;
             let input = &held[..held.len().min(usize::try_from(self.left).unwrap_or(usize::MAX))];
-            if input.is_empty() && self.left > 0 {
-                return Err(cut(format!("the file ends in a container {} bytes too early", self.left)));
-            }
+            let is_at_end = input.is_empty();
             let before = (self.inflate.total_in(), self.inflate.total_out());
-            let flush = if input.is_empty() { FlushDecompress::Finish } else { FlushDecompress::None };
-            let status = self.inflate.decompress(input, &mut out[..limit], flush);
+            let status = self.inflate.decompress(input, &mut out[..limit], FlushDecompress::None);
             let [used, made] = [self.inflate.total_in() - before.0, self.inflate.total_out() - before.1];
             self.file.consume(used as usize);
             self.left -= used;
-            let status = status.map_err(|error| damaged(format!("container with damaged zlib data: {error}")))?;
-            if made > 0 || status == Status::StreamEnd || limit == 0 {
+            // Bytes before damage are good. The next call returns the error again.
+            if made > 0 || limit == 0 {
                 return Ok(made as usize);
             }
-            if used == 0 {
-                return Err(damaged("container whose zlib data end too early"));
+            match status {
+                Ok(Status::StreamEnd) => return Ok(0),
+                Ok(_) if is_at_end && self.left > 0 => {
+                    return Err(cut(format!("the file ends in a container {} bytes too early", self.left)));
+                }
+                Ok(_) if used == 0 => return Err(damaged("container whose zlib data end too early")),
+                Ok(_) => {}
+                Err(error) => return Err(damaged(format!("container with damaged zlib data: {error}"))),
             }
         }
     }
