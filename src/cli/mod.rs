@@ -7,6 +7,8 @@ mod cells;
 mod check;
 mod command;
 mod common;
+#[cfg(feature = "lab")]
+mod convert;
 mod dbc;
 mod demo;
 #[cfg(feature = "lab")]
@@ -146,6 +148,9 @@ enum Command {
     /// Compare alarm settings across recorded logs
     #[cfg(feature = "lab")]
     Whatif(Box<whatif::Args>),
+    /// Write the frames of logs in any known format as a candump log, MF4 or MCAP
+    #[cfg(feature = "lab")]
+    Convert(Box<convert::Args>),
     /// Write the estimates, half-cycles and alarms of many logs as Parquet or CSV
     #[cfg(feature = "lab")]
     Export(Box<export::Args>),
@@ -206,6 +211,8 @@ pub fn main() -> ExitCode {
         Command::Gpr(args) => gpr::run(&args),
         #[cfg(feature = "lab")]
         Command::Whatif(args) => whatif::run(&args),
+        #[cfg(feature = "lab")]
+        Command::Convert(args) => convert::run(&args),
         #[cfg(feature = "lab")]
         Command::Export(args) => export::run(&args),
         #[cfg(feature = "lab")]

@@ -3,6 +3,9 @@
 use std::fs::File;
 use std::io::{self, Read};
 
+use crate::blf::{self, BlfReader};
+use crate::mf4::{self, Mf4Reader};
+use crate::pcap::{self, PcapNgReader, PcapReader};
 use crate::{LogReader, text};
 
 /// A log format of another tool.
@@ -29,6 +32,15 @@ pub enum Format {
     CanKing,
     /// BUSMASTER log.
     Busmaster,
+    // Binary formats.
+    /// Vector binary logging format.
+    Blf,
+    /// ASAM measurement data format, version 4, with the frames of a bus.
+    Mf4,
+    /// Packet capture of SocketCAN, old form.
+    Pcap,
+    /// Packet capture of SocketCAN, new form.
+    PcapNg,
 }
 
 /// An open log.
@@ -53,6 +65,11 @@ impl Format {
         Self::Crtd,
         Self::CanKing,
         Self::Busmaster,
+        // Binary formats.
+        Self::Blf,
+        Self::Mf4,
+        Self::Pcap,
+        Self::PcapNg,
     ];
 
     /// Number of bytes from which [`recognise`](Self::recognise) finds every format.
@@ -61,7 +78,7 @@ impl Format {
     /// Finds the format from the first bytes of a log (at most [`HEAD_BYTES`](Self::HEAD_BYTES) are needed). `None` =
     /// none of these formats.
     pub fn recognise(head: &[u8]) -> Option<Self> {
-        text::recognise(&head[..head.len().min(Self::HEAD_BYTES)])
+        binary(head).or_else(|| text::recognise(&head[..head.len().min(Self::HEAD_BYTES)]))
     }
 
     /// Opens a log of this format.
@@ -70,17 +87,13 @@ impl Format {
     /// Fails if the source cannot be read or its header is damaged.
     pub fn open(self, source: Source) -> io::Result<Box<dyn LogReader>> {
         match self {
+            // Binary formats.
+            Self::Blf => Ok(Box::new(BlfReader::open(source)?)),
+            Self::Mf4 => Ok(Box::new(Mf4Reader::open(source)?)),
+            Self::Pcap => Ok(Box::new(PcapReader::open(source)?)),
+            Self::PcapNg => Ok(Box::new(PcapNgReader::open(source))),
             // Text formats.
-            Self::Candump
-            | Self::CandumpDeltas
-            | Self::Asc
-            | Self::Trc
-            | Self::Gvret
-            | Self::PythonCanCsv
-            | Self::Css
-            | Self::Crtd
-            | Self::CanKing
-            | Self::Busmaster => text::open(self, source.reader),
+            text => text::open(text, source.reader),
         }
     }
 
@@ -98,6 +111,25 @@ impl Format {
             Self::Crtd => "OVMS CRTD",
             Self::CanKing => "Kvaser CanKing text",
             Self::Busmaster => "BUSMASTER log",
+            // Binary formats.
+            Self::Blf => "Vector BLF",
+            Self::Mf4 => "ASAM MF4",
+            Self::Pcap => "PCAP",
+            Self::PcapNg => "PCAPNG",
         }
+    }
+}
+
+/// Finds a binary format.
+fn binary(head: &[u8]) -> Option<Format> {
+    let begins = |magics: &[&[u8]]| magics.iter().any(|magic| head.starts_with(magic));
+    if begins(&[blf::MAGIC]) {
+        Some(Format::Blf)
+    } else if begins(&mf4::MAGICS) {
+        Some(Format::Mf4)
+    } else if pcap::Form::of_magic(head).is_some() {
+        Some(Format::Pcap)
+    } else {
+        begins(&[pcap::SECTION_HEADER]).then_some(Format::PcapNg)
     }
 }

@@ -5,16 +5,27 @@
 //! the size of the file. A bad part costs only this part ([`Item::Bad`]). A file that ends too early, or whose
 //! structure is damaged, ends with an error after all frames before the damage.
 //!
+//! [`Mf4Writer`] writes frames as MF4, for other tools.
+//!
 //! candump logs (`candump -L`), journals and CSV tables are read by `packwatch_host::io::log`.
 
+mod blf;
+mod byte_stream;
+mod channel_list;
 mod foreign;
 mod format;
 mod item;
+mod mf4;
+mod pcap;
+mod raw_frame;
+#[cfg(test)]
+mod testing;
 mod text;
 
 pub use foreign::foreign;
 pub use format::{Format, Source};
 pub use item::{Channel, Item, Position};
+pub use mf4::Mf4Writer;
 
 use std::io;
 

@@ -96,6 +96,9 @@ pub(crate) fn open(format: Format, source: Box<dyn Read>) -> io::Result<Box<dyn 
         Format::Crtd => TextLog::<crtd::Crtd>::open(source),
         Format::CanKing => TextLog::<canking::CanKing>::open(source),
         Format::Busmaster => TextLog::<busmaster::Busmaster>::open(source),
+        Format::Blf | Format::Mf4 | Format::Pcap | Format::PcapNg => {
+            Err(io::Error::new(io::ErrorKind::InvalidInput, format!("{} is not a text format", format.name())))
+        }
     }
 }
 

@@ -20,6 +20,8 @@ mod cell_rules;
 mod check_cli;
 mod contactor;
 mod contract;
+#[cfg(feature = "lab")]
+mod convert_cli;
 mod dbc_vectors;
 mod diagnose_cli;
 mod diagnostic;

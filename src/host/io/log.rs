@@ -132,6 +132,9 @@ struct ReadState {
     counts: LogCounts,
     strict: bool,
     interfaces: Vec<String>,
+    /// Number of configured interfaces, which are the first ones.
+    #[cfg(feature = "formats")]
+    configured: usize,
     channels: Vec<(String, String)>,
     /// Parser that knows the interfaces.
     parser: LineParser,
@@ -161,6 +164,8 @@ impl LogSource {
                 counts: LogCounts::default(),
                 strict: options.strict,
                 parser: LineParser::new(&options.interfaces),
+                #[cfg(feature = "formats")]
+                configured: options.interfaces.len(),
                 interfaces: options.interfaces,
                 channels: options.channels,
                 adopt: false,
@@ -600,7 +605,7 @@ impl ReadState {
         let (written, default) = match channel {
             LogChannel::Name(name) => (name.clone(), name.clone()),
             LogChannel::Number { written, index } => {
-                let configured = self.interfaces.get(*index as usize).cloned();
+                let configured = self.interfaces[..self.configured].get(*index as usize).cloned();
                 (written.to_string(), configured.unwrap_or_else(|| format!("can{index}")))
             }
         };

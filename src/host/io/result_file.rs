@@ -4,7 +4,7 @@
 //! complete it, the part is deleted. `-` is standard output. A device or pipe is written directly.
 
 use std::fs::{self, File};
-use std::io::{self, BufWriter, Write};
+use std::io::{self, BufWriter, Seek, SeekFrom, Write};
 use std::os::fd::AsFd;
 use std::path::{Path, PathBuf};
 
@@ -59,6 +59,13 @@ impl Write for ResultFile {
 
     fn flush(&mut self) -> io::Result<()> {
         self.out.flush().map_err(|e| named(&self.path, e))
+    }
+}
+
+impl Seek for ResultFile {
+    /// Fails if the file is a pipe.
+    fn seek(&mut self, place: SeekFrom) -> io::Result<u64> {
+        self.out.seek(place).map_err(|e| named(&self.path, e))
     }
 }
 

@@ -1,0 +1,162 @@
+//! Vector BLF (binary logging format): a header with the start date, then objects, usually in compressed containers.
+//!
+//! The containers make up one stream of objects: an object may continue in the next container. A damaged container or
+//! object costs only itself; reading continues at the next object mark. Sources: the field layout that Vector publishes
+//! with its `binlog` interface, compared with the files that python-can writes.
+
+mod container;
+mod object;
+
+use std::io;
+
+use packwatch_core::quantity::Timestamp;
+
+use self::container::Containers;
+use crate::byte_stream::{ByteStream, WINDOW, cut, damaged, u16_at, u32_at};
+use crate::channel_list::ChannelList;
+use crate::{Channel, Item, LogReader, Position, Source};
+
+/// First bytes of a file.
+pub(crate) const MAGIC: &[u8] = b"LOGG";
+/// First bytes of an object.
+const MARK: &[u8] = b"LOBJ";
+/// Size of the header's fields used here, and the smallest possible header, bytes.
+const HEADER_FIELDS: usize = 56;
+/// Size of an object's first part, bytes.
+const OBJECT_HEAD: usize = 16;
+/// Objects that are longer must be damaged, bytes. Recorders write images and packets of at most a few MiB.
+const MAX_OBJECT: usize = 16 << 20;
+
+/// Reads a BLF file.
+pub(crate) struct BlfReader {
+    objects: ByteStream<Containers>,
+    start_ns: i64,
+    channels: ChannelList,
+    has_ended: bool,
+    /// Whether the next object must be searched for, because the bytes before it are damaged.
+    is_lost: bool,
+}
+
+impl BlfReader {
+    /// Reads the header.
+    ///
+    /// # Errors
+    /// Fails if the source cannot be read or its header is damaged.
+    pub(crate) fn open(source: Source) -> io::Result<Self> {
+        let mut file = ByteStream::new(source.reader);
+        let head = file.fill(HEADER_FIELDS)?;
+        if head.len() < HEADER_FIELDS {
+            return Err(cut(format!("the file ends in its header after {} bytes, must have 144", head.len())));
+        }
+        let size = u32_at(head, 4, false) as usize;
+        if !(HEADER_FIELDS..=WINDOW).contains(&size) {
+            return Err(damaged(format!("header of {size} bytes, must be {HEADER_FIELDS} to {WINDOW} (usual: 144)")));
+        }
+        let date = std::array::from_fn(|part| u16_at(head, 40 + 2 * part, false));
+        let start_ns = unix_ms(date).map_or(0, |ms| ms.saturating_mul(1_000_000));
+        file.skip(size as u64)?;
+        let objects = ByteStream::new(Containers::new(file));
+        Ok(Self { objects, start_ns, channels: ChannelList::default(), has_ended: false, is_lost: false })
+    }
+
+    /// Reads the next object; `None` at the end.
+    fn next_object(&mut self) -> io::Result<Option<Item>> {
+        if self.is_lost {
+            self.is_lost = false;
+            if !self.objects.find(0, MARK)? {
+                return Ok(None);
+            }
+        }
+        let mut head = self.objects.fill(OBJECT_HEAD)?;
+        if !head.starts_with(MARK) {
+            // Objects are padded to a multiple of four bytes, some by other rules.
+            let first = &head[..head.len().min(OBJECT_HEAD)];
+            let padding = first.iter().take_while(|byte| **byte == 0).count();
+            if padding == first.len() {
+                self.objects.consume(padding);
+                return Ok((padding == OBJECT_HEAD).then_some(Item::Other));
+            }
+            self.objects.consume(padding);
+            head = self.objects.fill(OBJECT_HEAD)?;
+            if !head.starts_with(MARK) && head.len() >= MARK.len() {
+                self.is_lost = true;
+                return Ok(Some(Item::Bad("no object mark LOBJ at the end of the object before".to_owned())));
+            }
+        }
+        if head.len() < OBJECT_HEAD {
+            return Err(cut("the file ends in the head of an object"));
+        }
+        let [size, kind] = [8, 12].map(|at| u32_at(head, at, false));
+        let size = size as usize;
+        let largest = if object::is_of_can(kind) { object::MAX_CAN_OBJECT } else { MAX_OBJECT };
+        if !(OBJECT_HEAD..=largest).contains(&size) {
+            self.objects.consume(MARK.len());
+            self.is_lost = true;
+            let text = format!("object of kind {kind} and {size} bytes, must be {OBJECT_HEAD} to {largest} bytes");
+            return Ok(Some(Item::Bad(text)));
+        }
+        if !object::is_of_can(kind) {
+            let is_whole = self.objects.skip(size as u64)?;
+            return if is_whole { Ok(Some(Item::Other)) } else { Err(cut("the file ends in an object")) };
+        }
+        let bytes = self.objects.fill(size)?;
+        let Some(bytes) = bytes.get(..size) else {
+            return Err(cut(format!("the file ends in an object of {size} bytes after {}", bytes.len())));
+        };
+        let item = object::decode(kind, bytes, self.start_ns, &mut self.channels);
+        self.objects.consume(size);
+        Ok(Some(item.unwrap_or_else(Item::Bad)))
+    }
+}
+
+impl LogReader for BlfReader {
+    fn next_item(&mut self) -> io::Result<Option<Item>> {
+        if self.has_ended {
+            return Ok(None);
+        }
+        match self.next_object() {
+            // A container is damaged: the object that continues in it is lost, the next container may be good.
+            Err(error) if error.kind() == io::ErrorKind::InvalidData => {
+                self.objects.clear();
+                self.is_lost = true;
+                Ok(Some(Item::Bad(error.to_string())))
+            }
+            result => {
+                self.has_ended = !matches!(result, Ok(Some(_)));
+                result
+            }
+        }
+    }
+
+    fn position(&self) -> Position {
+        Position::Byte(self.objects.source().position())
+    }
+
+    fn channels(&self) -> &[Channel] {
+        self.channels.as_slice()
+    }
+}
+
+/// Milliseconds from 1970 to a date: year, month, day of the week, day, hour, minute, second, millisecond. The date has
+/// no time zone and is read as UTC, as other readers do. `None` = not a date.
+fn unix_ms([year, month, _, day, hour, minute, second, millisecond]: [u16; 8]) -> Option<i64> {
+    let is_date = year >= 1970 && (1..=12).contains(&month) && (1..=31).contains(&day);
+    let is_time = hour < 24 && minute < 60 && second <= 60 && millisecond < 1000;
+    if !is_date || !is_time {
+        return None;
+    }
+    // Days since 1 March of year 0: the leap day is the last day of its year.
+    let (year, month) = (i64::from(year) - i64::from(month < 3), (i64::from(month) + 9) % 12);
+    let days = 365 * year + year / 4 - year / 100 + year / 400 + (153 * month + 2) / 5 + i64::from(day) - 1 - 719_468;
+    let seconds = ((days * 24 + i64::from(hour)) * 60 + i64::from(minute)) * 60 + i64::from(second);
+    Some(seconds * 1000 + i64::from(millisecond))
+}
+
+/// Time of an object, rounded to a microsecond: writers compute the offset from floating-point Unix times.
+fn stamp(start_ns: i64, offset_ns: i64) -> Timestamp {
+    let nanos = start_ns.saturating_add(offset_ns);
+    Timestamp::from_nanos(nanos.saturating_add(500).div_euclid(1000).saturating_mul(1000))
+}
+
+#[cfg(test)]
+mod tests;

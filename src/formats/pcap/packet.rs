@@ -1,0 +1,120 @@
+//! Packets of SocketCAN, with or without the cooked header of Linux.
+
+use packwatch_core::quantity::Timestamp;
+
+use crate::byte_stream::{u16_at, u32_at};
+use crate::channel_list::ChannelList;
+use crate::raw_frame::RawFrame;
+use crate::{Channel, Item};
+
+/// What precedes a CAN frame in a packet.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum LinkType {
+    /// Nothing (LINKTYPE_CAN_SOCKETCAN).
+    SocketCan,
+    /// The cooked header of Linux (LINKTYPE_LINUX_SLL).
+    Cooked,
+    /// The cooked header with the interface's number (LINKTYPE_LINUX_SLL2).
+    CookedTwo,
+}
+
+impl LinkType {
+    /// The link type with this number, if it can carry CAN frames.
+    pub(super) fn of_number(number: u32) -> Option<Self> {
+        match number {
+            227 => Some(Self::SocketCan),
+            113 => Some(Self::Cooked),
+            276 => Some(Self::CookedTwo),
+            _ => None,
+        }
+    }
+}
+
+/// Message about a capture that cannot contain CAN frames.
+pub(super) fn other_link_type(number: u32) -> String {
+    format!("capture of link type {number}, must be 227 (SocketCAN), 113 or 276 (cooked capture of Linux)")
+}
+
+/// Hardware type of CAN interfaces.
+const HARDWARE_CAN: u16 = 280;
+/// Protocols in the cooked header.
+const PROTOCOL_CAN: u16 = 0x000C;
+const PROTOCOL_CAN_FD: u16 = 0x000D;
+const PROTOCOL_CAN_XL: u16 = 0x000E;
+
+/// Flags of the identifier.
+const EXTENDED: u32 = 1 << 31;
+const REMOTE: u32 = 1 << 30;
+const ERROR: u32 = 1 << 29;
+/// Flags of CAN FD and CAN XL.
+const BRS: u8 = 1;
+const ESI: u8 = 2;
+const FD: u8 = 4;
+const XL: u8 = 0x80;
+/// Size of the head of a frame, bytes.
+const FRAME_HEAD: usize = 8;
+
+/// Decodes a packet. `channel` is the interface that the file names. `big_endian` is the byte order of the file.
+pub(super) fn decode(
+    link: Option<LinkType>,
+    packet: &[u8],
+    big_endian: bool,
+    time: Timestamp,
+    channel: Option<&Channel>,
+    channels: &mut ChannelList,
+) -> Item {
+    let (cooked, number_at) = match link {
+        None => return Item::Other,
+        Some(LinkType::SocketCan) => (None, None),
+        Some(LinkType::Cooked) => (Some((16, 2, 14)), None),
+        Some(LinkType::CookedTwo) => (Some((20, 8, 0)), Some(4)),
+    };
+    let (mut head, mut protocol) = (0, None);
+    if let Some((len, hardware_at, protocol_at)) = cooked {
+        if packet.len() < len {
+            return Item::Bad(format!("packet of {} bytes, must have a cooked header of {len}", packet.len()));
+        }
+        if u16_at(packet, hardware_at, true) != HARDWARE_CAN {
+            return Item::Other;
+        }
+        (head, protocol) = (len, Some(u16_at(packet, protocol_at, true)));
+    }
+    let is_fd = match protocol {
+        None => false,
+        Some(PROTOCOL_CAN) => false,
+        Some(PROTOCOL_CAN_FD) => true,
+        Some(PROTOCOL_CAN_XL) => return Item::Xl,
+        Some(_) => return Item::Other,
+    };
+    let channel = match channel {
+        Some(channel) => channels.index_of(channel),
+        None => channels.of_label(number_at.map_or(0, |at| u32_at(packet, at, true))),
+    };
+    let Some(channel) = channel else { return Item::Bad("more than 256 channels".to_owned()) };
+    // Without a cooked header, the identifier is big-endian; with it, the identifier has the recorder's byte order.
+    let is_big_endian = protocol.is_none() || big_endian;
+    frame(&packet[head..], is_big_endian, is_fd, time, channel).unwrap_or_else(Item::Bad)
+}
+
+fn frame(bytes: &[u8], big_endian: bool, is_fd: bool, time: Timestamp, channel: u8) -> Result<Item, String> {
+    if bytes.len() < FRAME_HEAD {
+        return Err(format!("CAN frame of {} bytes, must have at least {FRAME_HEAD}", bytes.len()));
+    }
+    let (id, len, flags) = (u32_at(bytes, 0, big_endian), usize::from(bytes[4]), bytes[5]);
+    // The flags of CAN XL lie where other frames have their length, which is at most 64.
+    if bytes[4] & XL != 0 {
+        return Ok(Item::Xl);
+    }
+    if id & ERROR != 0 {
+        return Ok(Item::ErrorFrame { time, channel, class: id & (ERROR - 1) });
+    }
+    let remote = id & REMOTE != 0;
+    let fd = (is_fd || flags & FD != 0 || len > 8).then_some((flags & BRS != 0, flags & ESI != 0));
+    let data = if remote { &[0; 8][..len.min(8)] } else { bytes.get(FRAME_HEAD..FRAME_HEAD + len).unwrap_or(&[]) };
+    if data.len() < len && !remote {
+        return Err(format!("CAN frame of {len} bytes in a packet with {}", bytes.len() - FRAME_HEAD));
+    }
+    let extended = id & EXTENDED != 0;
+    let frame = RawFrame { id: id & (ERROR - 1), extended, remote, fd: fd.filter(|_| !remote), data }.check()?;
+    Ok(Item::Frame { time, channel, frame })
+}
