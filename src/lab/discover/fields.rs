@@ -60,6 +60,10 @@ pub(super) fn signals(capture: &Capture, label: &PackLabel) -> Vec<LogSignal> {
     let others = messages.iter().filter(|samples| !of_cells.contains(&samples.key));
     let mut voltages: Vec<LogSignal> = others.flat_map(|samples| voltages_of(samples, label, sum_v)).collect();
     voltages.sort_by(|a, b| swing(&a.series).total_cmp(&swing(&b.series)).then_with(|| a.name.cmp(&b.name)));
+    let is_sum = |voltage: &LogSignal| (voltage.series.extent.mean() / sum_v - 1.0).abs() <= SUM_TOLERANCE;
+    if voltages.iter().any(is_sum) {
+        voltages.retain(is_sum);
+    }
     voltages.truncate(16);
     let compared: Vec<&LogSignal> = voltages.iter().chain(found.first()).collect();
     let others = messages.iter().filter(|samples| !of_cells.contains(&samples.key));
