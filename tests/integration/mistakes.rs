@@ -242,7 +242,7 @@ fn hole_in_log_is_named_with_its_times() {
         std::fs::write(&pack.log, text.lines().filter(is_kept).map(|line| format!("{line}\n")).collect::<String>())
             .unwrap();
         let (code, text) = pack.doctor(&[]);
-        assert!(code == 1 && text.contains(words) && text.contains("from 19"), "{text}");
+        assert!(code == 1 && text.contains(words) && text.contains("to 2.556 h after the first frame"), "{text}");
     }
 }
 

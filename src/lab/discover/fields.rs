@@ -60,6 +60,10 @@ pub(super) fn signals(capture: &Capture, label: &PackLabel) -> Vec<LogSignal> {
     let others = messages.iter().filter(|samples| !of_cells.contains(&samples.key));
     let mut voltages: Vec<LogSignal> = others.flat_map(|samples| voltages_of(samples, label, sum_v)).collect();
     voltages.sort_by(|a, b| swing(&a.series).total_cmp(&swing(&b.series)).then_with(|| a.name.cmp(&b.name)));
+    let is_sum = |voltage: &LogSignal| (voltage.series.extent.mean() / sum_v - 1.0).abs() <= SUM_TOLERANCE;
+    if voltages.iter().any(is_sum) {
+        voltages.retain(is_sum);
+    }
     voltages.truncate(16);
     let compared: Vec<&LogSignal> = voltages.iter().chain(found.first()).collect();
     let others = messages.iter().filter(|samples| !of_cells.contains(&samples.key));
@@ -324,7 +328,11 @@ fn pages(payloads: &Payloads) -> Vec<Option<u8>> {
     let values: BTreeSet<u8> = payloads.iter().filter_map(|(_, data)| data.first().copied()).collect();
     let span = values.first().zip(values.last()).map_or(0, |(first, last)| usize::from(last - first) + 1);
     let is_counter = (2..=64).contains(&values.len()) && span == values.len() && payloads.len() >= 3 * span;
-    if is_counter { values.into_iter().map(Some).collect() } else { vec![None] }
+    // A page number changes from payload to payload; the high byte of a big-endian voltage seldom does.
+    let firsts: Vec<Option<&u8>> = payloads.iter().map(|(_, data)| data.first()).collect();
+    let changes = firsts.windows(2).filter(|pair| pair[0] != pair[1]).count();
+    let is_cycling = 2 * changes >= payloads.len();
+    if is_counter && is_cycling { values.into_iter().map(Some).collect() } else { vec![None] }
 }
 
 /// Finds the longest run of plausible neighbouring fields with similar values.

@@ -187,9 +187,17 @@ impl Series {
         self.extent.range() == 0.0
     }
 
-    /// Number of different values among the first hundred kept values.
+    /// Number of different values among a hundred kept values, evenly spread.
     pub fn distinct(&self) -> usize {
-        self.values.kept().iter().take(100).map(|value| value.to_bits()).collect::<BTreeSet<u64>>().len()
+        let stride = (self.values.kept().len() / 100).max(1);
+        self.values
+            .kept()
+            .iter()
+            .step_by(stride)
+            .take(100)
+            .map(|value| value.to_bits())
+            .collect::<BTreeSet<u64>>()
+            .len()
     }
 
     /// Whether the signal is a counter: most of its steps have the same non-zero size.
@@ -204,7 +212,7 @@ impl Series {
     }
 
     /// The code that means zero in a signal of `factor` per code: 0, or an offset if the values never come near zero.
-    /// `None` if no usual offset lies among the codes.
+    /// `None` if no usual offset lies among or near the codes.
     pub fn zero_code(&self, factor: f64) -> Option<f64> {
         let (low, high) = (self.extent.min / factor, self.extent.max / factor);
         if low - 3.0 * (high - low) <= 0.0 {
@@ -212,8 +220,11 @@ impl Series {
         }
         // The middle of a 16-bit and a 12-bit field, then round numbers, the roundest first.
         let powers = [32_768.0, 32_767.0, 2048.0, 32_000.0].into_iter();
-        let round = [10_000.0, 5000.0, 1000.0, 500.0, 100.0].into_iter().map(|step| (high / step).floor() * step);
-        powers.chain(round).find(|zero| (low..=high).contains(zero))
+        let round =
+            [10_000.0, 5000.0, 1000.0, 500.0, 100.0].into_iter().map(|step| (0.5 * (low + high) / step).round() * step);
+        // While a pack is only discharged, zero lies beside the codes.
+        let (low, high) = (2.0 * low - high, 2.0 * high - low);
+        powers.chain(round).find(|zero| *zero > 0.0 && (low..=high).contains(zero))
     }
 
     /// Largest step between consecutive kept values.

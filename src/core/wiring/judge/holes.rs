@@ -46,27 +46,29 @@ fn used_hole<'d>(judge: &Judge<'d>) -> Option<(&'d Hole, String)> {
     let moments = judge.observed.usage.moments();
     let use_of = |hole: &'d Hole| {
         let before = moments.iter().rfind(|moment| moment.time <= hole.from)?;
-        let after = moments.iter().find(|moment| moment.time >= hole.to)?;
+        let after = &moments[moments.partition_point(|moment| moment.time < hole.to)..];
         Some((hole, use_between(judge, before, after)?))
     };
     let used = judge.observed.holes.iter().filter_map(use_of);
     used.max_by(|a, b| a.0.seconds().total_cmp(&b.0.seconds()))
 }
 
-fn use_between(judge: &Judge<'_>, before: &Moment, after: &Moment) -> Option<String> {
+fn use_between(judge: &Judge<'_>, before: &Moment, after: &[Moment]) -> Option<String> {
     /// A reported state of charge that changes by more than this shows that charge flowed.
     const LEAST_CHANGE: f64 = 0.02;
     let socs = judge.observed.witnesses.iter().enumerate();
     let mut socs = socs.filter(|(_, w)| judge.plan.witness(**w).binding.channel == Channel::ReportedSoc);
     let change = socs.find_map(|(place, _)| {
-        let (from, to) = (before.reported[place], after.reported[place]);
+        // The first reported value may arrive some time after the hole.
+        let to = after.iter().map(|moment| moment.reported[place]).find(|value| value.is_finite())?;
+        let from = before.reported[place];
         ((to - from).abs() > LEAST_CHANGE).then_some((from, to))
     });
-    let dead_a = judge.plan.pack.dead_band_a;
+    let (dead_a, after_a) = (judge.plan.pack.dead_band_a, after.first()?.current_a);
     if let Some((from, to)) = change {
         Some(format!("the reported SOC is {} % before and {} % after it", percent(from), percent(to)))
-    } else if before.current_a.abs() > dead_a && after.current_a.abs() > dead_a {
-        let [from, to] = [before.current_a, after.current_a].map(number);
+    } else if before.current_a.abs() > dead_a && after_a.abs() > dead_a {
+        let [from, to] = [before.current_a, after_a].map(number);
         Some(format!("the current is {from} A before and {to} A after it"))
     } else {
         None

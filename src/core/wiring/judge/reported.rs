@@ -120,6 +120,8 @@ fn size(judge: &mut Judge<'_>, (signal, current): (&SignalPlan, &SignalPlan), sl
     let [measured, configured] = [slope.capacity_ah, judge.pack_ah()].map(number);
     judge.is_size_explained = true;
     let (cell_ah, scale) = (slope.capacity_ah / strings, current.scale / ratio);
+    // The capacity of a used pack differs from the label, so a scale near 1 is probably 1.
+    let scale = if (0.8..=1.25).contains(&scale) { 1.0 } else { round(scale) };
     let seen = format!(
         "{} falls from 100 to 0 % over {measured} Ah counted from {}; {configured} Ah are configured",
         signal.name, current.name
@@ -131,13 +133,13 @@ fn size(judge: &mut Judge<'_>, (signal, current): (&SignalPlan, &SignalPlan), sl
             .seen(seen)
             .why(why)
             .change("pack", key, text)
-            .advice(format!("or {} is off by that factor (scale = {})", current.name, toml(round(scale))));
+            .advice(format!("or {} is off by that factor (scale = {})", current.name, toml(scale)));
     } else {
         let times = number(ratio.max(1.0 / ratio));
         error(judge, Topic::Unit, format!("pack current: off by a factor of {times}"))
             .seen(seen)
             .why(why)
-            .change(&current.table, "scale", toml(round(scale)))
+            .change(&current.table, "scale", toml(scale))
             .advice(format!("or the capacity is {measured} Ah"));
     }
 }
@@ -151,7 +153,9 @@ fn round(value: f64) -> f64 {
 fn reported<'d>(judge: &Judge<'d>, channel: Channel) -> Vec<Reported<'d>> {
     let witnesses = judge.observed.witnesses.iter().enumerate();
     let of_channel = witnesses.map(|(place, witness)| (judge.plan.witness(*witness), place));
-    let is_heard = |place: usize| judge.observed.usage.moments().iter().any(|m| m.reported[place].is_finite());
+    // A value that is always zero is not sent by this pack.
+    let is_sent = |value: f64| value.is_finite() && value != 0.0;
+    let is_heard = |place: usize| judge.observed.usage.moments().iter().any(|m| is_sent(m.reported[place]));
     of_channel.filter(|(signal, place)| signal.binding.channel == channel && is_heard(*place)).collect()
 }
 
@@ -261,7 +265,9 @@ fn contradiction(judge: &mut Judge<'_>, seen: String, counts: Option<(u16, u16)>
         .seen(seen)
         .why("the voltage of a cell shows its state of charge, and the pack reports another one");
     if let Some(counts) = counts {
-        finding.change("pack", "cells", format!("{counts}, the number in the pack's documentation"));
+        let is_one = counts.parse::<u16>().is_ok();
+        let text = if is_one { counts } else { format!("{counts}, the number in the pack's documentation") };
+        finding.change("pack", "cells", text);
     }
     if let Some((key, text)) = model {
         finding.change("pack", key, text);

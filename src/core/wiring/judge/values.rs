@@ -175,6 +175,9 @@ fn current(judge: &mut Judge<'_>) {
     let Some((signal, series)) = judge.current().filter(|(_, series)| series.count() > 0) else { return };
     let limit_a = MAX_C_RATE * judge.pack_ah();
     let all = [(signal, series)];
+    if missing_offset(judge, &all[0]) {
+        return;
+    }
     let largest_a = series.values.bulk().map_or(0.0, |(low, high)| low.abs().max(high.abs()));
     let better = better_layout(&all, |signal, other| {
         let most = other.extent.min.abs().max(other.extent.max.abs());
@@ -184,9 +187,6 @@ fn current(judge: &mut Judge<'_>) {
     if let Some(better) = better {
         judge.is_mixed_up = true;
         return wrong_layout(judge, &all, better, "pack current");
-    }
-    if missing_offset(judge, &all[0]) {
-        return;
     }
     let unit = unit_of(&signal.unit).map(|(_, factor, _)| factor).filter(|f| *f != 1.0 && signal.scale == 1.0);
     let c_rate = largest_a / judge.pack_ah();
