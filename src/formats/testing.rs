@@ -26,11 +26,9 @@ impl ReadLog {
 
     /// The texts of bad parts.
     pub(crate) fn bad(&self) -> Vec<&str> {
-        let text = |item: &'_ Item| matches!(item, Item::Bad(_));
         self.items
             .iter()
-            .filter(|item| text(item))
-            .map(|item| if let Item::Bad(text) = item { text } else { "" })
+            .filter_map(|item| if let Item::Bad(text) = item { Some(text.as_str()) } else { None })
             .collect()
     }
 }

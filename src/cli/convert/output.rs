@@ -36,8 +36,8 @@ impl Format {
 /// A file being written.
 pub(super) enum Output {
     Candump(CandumpFile),
-    Mf4(Mf4Writer<ResultFile>),
-    Mcap(McapFile),
+    Mf4(Box<Mf4Writer<ResultFile>>),
+    Mcap(Box<McapFile>),
 }
 
 impl Output {
@@ -46,8 +46,8 @@ impl Output {
         let file = ResultFile::create(path)?;
         Ok(match format {
             Format::Candump => Self::Candump(CandumpFile::new(file, path)?),
-            Format::Mf4 => Self::Mf4(Mf4Writer::new(file)?),
-            Format::Mcap => Self::Mcap(McapFile::new(file)?),
+            Format::Mf4 => Self::Mf4(Box::new(Mf4Writer::new(file)?)),
+            Format::Mcap => Self::Mcap(Box::new(McapFile::new(file)?)),
         })
     }
 
