@@ -172,6 +172,7 @@ impl Kind {
             | Channel::SupplyVoltage
             | Channel::Balancing(_)
             | Channel::PackIdentity
+            | Channel::CurrentDirection
             | Channel::Contactor => Self::Reported,
         }
     }
