@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use super::common::alarms::{AlarmGroup, grouped, with_unit};
+use super::common::alarms::{AlarmGroup, grouped};
 use super::common::control::ControlArgs;
 use super::common::output;
 use super::common::output::{print, word};
@@ -77,8 +77,8 @@ fn row(group: &AlarmGroup) -> Vec<String> {
         alarm.severity.name().to_owned(),
         group.cells(),
         word(alarm.state),
-        alarm.value.map_or_else(|| "unknown".to_owned(), |value| with_unit(alarm.rule, value)),
-        with_unit(alarm.rule, alarm.threshold),
+        alarm.value.map_or_else(|| "unknown".to_owned(), |value| alarm.rule.with_unit(value)),
+        alarm.rule.with_unit(alarm.threshold),
         alarm.probability.map_or_else(|| "-".to_owned(), |probability| format!("{:.1} %", 100.0 * probability)),
         alarm.occurrences.to_string(),
         stamp(alarm.first_raised),

@@ -89,7 +89,9 @@ fn show(description: &Description, page: &mut String) {
         }
         page.push_str(&format!("  {}: {kind}, {ids}\n", interface.name));
     }
-    list("signals", &table(description.signals.iter().map(signal)), "", page);
+    let has_direction = description.signals.iter().any(|signal| signal.channel == "direction of the current");
+    let signals = description.signals.iter().map(|of| signal(of, has_direction));
+    list("signals", &table(signals), "", page);
     list("plausible readings", &description.limits, "", page);
     list("checks of frames", &description.intake, "", page);
     list("diagnostic requests", &description.polling, "none sent", page);
@@ -122,10 +124,13 @@ fn table(rows: impl Iterator<Item = Vec<String>>) -> Vec<String> {
     output::table::<&str>(&[], rows, usize::MAX).lines().map(str::to_owned).collect()
 }
 
-fn signal(signal: &SignalUse) -> Vec<String> {
+/// The row of a signal. `has_direction` states whether the current is a magnitude.
+fn signal(signal: &SignalUse, has_direction: bool) -> Vec<String> {
     let page = if signal.multiplex.is_empty() { String::new() } else { format!(" [{}]", signal.multiplex) };
     let mut notes = Vec::new();
-    if signal.scale < 0.0 {
+    if signal.channel == "pack current" && has_direction {
+        notes.push("magnitude".to_owned());
+    } else if signal.scale < 0.0 {
         notes.push("positive = charge on the bus".to_owned());
     } else if signal.channel == "pack current" {
         notes.push("positive = discharge on the bus".to_owned());

@@ -4,7 +4,7 @@
 
 use std::fmt::Write as _;
 
-use super::common::alarms::{cell, with_unit};
+use super::common::alarms::cell;
 use super::common::control::{ControlArgs, SelectorArgs, check_stored, replace_pack};
 use super::common::output::print;
 use crate::alarm::Alarm;
@@ -97,7 +97,7 @@ fn refusals(done: &CommandOutcome, word: &str) -> String {
     let mut text = format!("{} {alarms} not {word}:", done.refused);
     for alarm in &done.refused_alarms {
         let Alarm { rule, threshold, .. } = *alarm;
-        let value = alarm.value.map_or_else(|| "unknown".to_owned(), |value| with_unit(rule, value));
+        let value = alarm.value.map_or_else(|| "unknown".to_owned(), |value| rule.with_unit(value));
         let _ = write!(
             text,
             "\n  {} {}, cell {}: {} (value {value}, threshold {})",
@@ -105,7 +105,7 @@ fn refusals(done: &CommandOutcome, word: &str) -> String {
             alarm.severity.name(),
             cell(alarm.cell),
             refusal(alarm),
-            with_unit(rule, threshold)
+            rule.with_unit(threshold)
         );
     }
     let named = u32::try_from(done.refused_alarms.len()).unwrap_or(u32::MAX);

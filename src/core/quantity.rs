@@ -170,6 +170,8 @@ impl SensorIndex {
 pub enum Channel {
     /// State of the pack's contactors. When they are open, no current flows.
     Contactor,
+    /// Direction of a current that is sent as a magnitude: 1 = discharge, -1 = charge.
+    CurrentDirection,
     /// Pack current (A); positive = discharge, after the configured sign was applied.
     Current,
     /// A temperature sensor (degrees C).

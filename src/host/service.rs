@@ -28,7 +28,7 @@ use super::status::collect::ServiceIdentity;
 use super::status::document::ConfigFile;
 use crate::config::{Config, VehicleIdentity};
 use crate::io::can_key::CanKey;
-use crate::io::clock::{MappedClock, Reading};
+use crate::io::clock::{MappedClock, Reading, StepDetector};
 use crate::io::place::PlaceSetting;
 use crate::io::segments::SegmentLimits;
 use crate::io::socket::{Link, LinkConfig, LinkOutput};
@@ -129,7 +129,8 @@ impl Service {
     async fn serve(mut self) -> Result<(), ServiceError> {
         let stop = Stop::new(self.duration)?;
         let reload = Reload::new(&self.config)?;
-        let clock = MappedClock::new(Reading::now());
+        let start = Reading::now();
+        let clock = MappedClock::new(start);
         let (sender, inbox) = mpsc::channel(INBOX);
         let snapshot = self.snapshot.take();
         // The sockets are opened before any file, so that a second daemon does not overwrite the files of the first.
@@ -152,6 +153,7 @@ impl Service {
             pending_answers: pending_answers::PendingAnswers::default(),
             reload,
             clock,
+            clock_steps: StepDetector::new(start),
             batch: Vec::new(),
             left_out_reported: Instant::now(),
             status_publisher,

@@ -50,7 +50,7 @@ impl<T: ArrowPrimitiveType> Matrix<T> {
     }
 
     /// Index of a value in NumPy notation.
-    fn index(&self, at: usize) -> String {
+    pub(crate) fn index(&self, at: usize) -> String {
         let (row, column) = (at / self.columns.max(1), at % self.columns.max(1));
         if self.has_columns { format!("[{row}, {column}]") } else { format!("[{row}]") }
     }
@@ -64,6 +64,19 @@ pub(crate) fn reals(name: &str, values: &Bound<'_, PyAny>) -> PyResult<Reals> {
 /// Converts to reals of one column.
 pub(crate) fn column(name: &str, values: &Bound<'_, PyAny>) -> PyResult<Reals> {
     reals(name, values)?.one_column(name)
+}
+
+/// Converts to seconds in one column: numbers, or `datetime64` as Unix time. A missing `datetime64` becomes NaN.
+pub(crate) fn seconds(name: &str, values: &Bound<'_, PyAny>) -> PyResult<Reals> {
+    let numpy = values.py().import("numpy")?;
+    let none = |error: PyErr| data(format!("{name}: not an array of numbers: {error}"));
+    let array = numpy.call_method1("asanyarray", (values,)).map_err(none)?;
+    if array.getattr("dtype")?.getattr("kind")?.extract::<String>()? != "M" {
+        return column(name, values);
+    }
+    // Differences in microseconds are exact until the year 2255, and keep NaT, which becomes NaN.
+    let since = array.sub(numpy.call_method1("datetime64", (0, "us"))?)?;
+    column(name, &since.div(numpy.call_method1("timedelta64", (1, "s"))?)?)
 }
 
 /// Converts to whole numbers of one column.

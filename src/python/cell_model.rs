@@ -11,6 +11,9 @@ use crate::arrays;
 use crate::error::{config, data, file};
 use crate::table::{Table, reals};
 
+/// SOC of a voltage that a cell can have. A cell may be charged or discharged a little beyond its limits.
+const OCV_SOC: std::ops::RangeInclusive<f64> = -0.1..=1.1;
+
 /// A cell model.
 #[pyclass(frozen, module = "packwatch")]
 pub(crate) struct CellModel(SourcedModel);
@@ -133,7 +136,13 @@ impl CellModel {
                 "voltage_v = {voltage_v}, temperature_c = {temperature_c}, must be finite numbers"
             )));
         }
-        Ok(self.model().soc_of_ocv(voltage_v, temperature_c))
+        let soc = self.model().soc_of_ocv(voltage_v, temperature_c);
+        if OCV_SOC.contains(&soc) {
+            return Ok(soc);
+        }
+        let CoreModel { voltage_min_v, voltage_max_v, .. } = *self.model();
+        let hint = if (voltage_min_v..=voltage_max_v).contains(&(voltage_v / 1000.0)) { ": probably mV" } else { "" };
+        Err(data(format!("voltage_v = {voltage_v}, must be near {voltage_min_v} to {voltage_max_v} V{hint}")))
     }
 
     /// Returns the text of a cell model file, in the format of `model export`.

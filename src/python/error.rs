@@ -1,32 +1,75 @@
 //! Creates Python exceptions for errors of configurations, of data and arguments, and of files. The exceptions have the
-//! same texts as the errors of the command line.
+//! same texts as the errors of the command line, but name Python arguments instead of options.
 
 use std::fmt::Display;
 
 use packwatch_host::config::ConfigFaults;
 use packwatch_lab::error::{LabError, RequestError};
-use pyo3::PyErr;
+use pyo3::prelude::*;
 
 // These exceptions are defined in Python because each has two base classes: the common class, and ValueError or
 // OSError.
 pyo3::import_exception!(packwatch._errors, ConfigError);
 pyo3::import_exception!(packwatch._errors, DataError);
-pyo3::import_exception!(packwatch._errors, FileError);
 
 /// An error of data or arguments.
 pub(crate) fn data(error: impl Display) -> PyErr {
-    DataError::new_err(error.to_string())
+    DataError::new_err(printable(&with_arguments(&error.to_string())))
 }
 
-/// An error of reading or writing a file.
+/// Options of the command line whose Python argument has another name. The names of all others differ only in `-`.
+const ARGUMENTS: [(&str, &str); 8] = [
+    ("--capacity", "capacity_ah"),
+    ("--column", "columns"),
+    ("--rated", "rated_ah"),
+    ("--settle", "settle_s"),
+    ("--tau", "tau_s"),
+    ("--temperatures", "temperatures_c"),
+    ("--voltage-max", "voltage_max_v"),
+    ("--voltage-min", "voltage_min_v"),
+];
+
+/// The text with the Python argument in place of each option of the command line.
+fn with_arguments(text: &str) -> String {
+    let argument = |word: &str| {
+        let end = word.find(|c: char| !c.is_ascii_lowercase() && c != '-').unwrap_or(word.len());
+        let (option, rest) = word.split_at(end);
+        let known = ARGUMENTS.iter().find(|(known, _)| *known == option).map(|(_, argument)| (*argument).to_owned());
+        match option.strip_prefix("--").filter(|name| name.starts_with(|c: char| c.is_ascii_lowercase())) {
+            Some(name) => known.unwrap_or_else(|| name.replace('-', "_")) + rest,
+            None => word.to_owned(),
+        }
+    };
+    text.split(' ').map(argument).collect::<Vec<_>>().join(" ")
+}
+
+/// An error of reading or writing a file. Its class and its `errno` follow from the number of the operating system's
+/// error, with which the text ends.
 pub(crate) fn file(error: impl Display) -> PyErr {
-    FileError::new_err(error.to_string())
+    let text = printable(&error.to_string());
+    Python::attach(|py| {
+        let made = py.import("packwatch._errors").and_then(|module| module.call_method1("file_error", (text,)));
+        made.map_or_else(|error| error, PyErr::from_value)
+    })
+}
+
+/// The text with its control characters escaped, because an exception is printed to a terminal. Line ends are kept.
+fn printable(text: &str) -> String {
+    let mut safe = String::with_capacity(text.len());
+    for c in text.chars() {
+        if c.is_control() && c != '\n' {
+            safe.extend(c.escape_default());
+        } else {
+            safe.push(c);
+        }
+    }
+    safe
 }
 
 /// The faults of a configuration.
 pub(crate) fn config(faults: ConfigFaults) -> PyErr {
-    let text = faults.to_string();
-    ConfigError::new_err((text, faults.0))
+    let faults: Vec<String> = faults.0.iter().map(|fault| printable(fault)).collect();
+    ConfigError::new_err((faults.join("\n"), faults))
 }
 
 /// An error of the library.

@@ -11,7 +11,7 @@ use packwatch_host::can::{CanId, Frame};
 use packwatch_host::config::Config;
 use packwatch_host::quantity::{BusIndex, CellIndex, Timestamp};
 use packwatch_host::replay::MonitorDriver;
-use packwatch_host::sample::VoltageSource;
+use packwatch_host::sample::{Limits, SampleConfig, VoltageSource};
 use packwatch_lab::single_cell::CellSource;
 use pyo3::prelude::*;
 
@@ -34,6 +34,7 @@ pub(crate) struct Monitor {
     interfaces: Vec<String>,
     cells: u16,
     is_pack_total: bool,
+    limits: PlausibleRanges,
 }
 
 /// State after the inputs processed so far.
@@ -42,6 +43,8 @@ struct State {
     columns: Columns,
     wanted: Wanted,
     cells: usize,
+    /// Time of the latest input (s); the next input must not be earlier.
+    latest_s: f64,
 }
 
 #[pymethods]
@@ -102,7 +105,7 @@ impl Monitor {
         Ok(self.state.wait(py)?.driver.uncarried_values)
     }
 
-    /// Processes rows.
+    /// Processes rows. The times are seconds or `datetime64`, and do not run backwards.
     #[pyo3(signature = (time_s, current_a, voltage_v, temperature_c=None, *, progress=false))]
     fn rows(
         &self,
@@ -121,7 +124,8 @@ impl Monitor {
             is_pack_total: self.is_pack_total,
         };
         input.check(time_s.rows, if self.is_pack_total { 1 } else { usize::from(self.cells) })?;
-        self.work(py, progress, time_s.rows, |state, work| state.take_rows(&time_s, &input, work))
+        self.limits.check(&input)?;
+        self.work(py, progress, &time_s, |state, work| state.take_rows(&time_s, &input, work))
     }
 
     /// Processes frames.
@@ -152,7 +156,7 @@ impl Monitor {
         // All frames are checked before the first frame is processed, so that an error does not leave some of them
         // processed.
         let frames = (0..time_s.rows).map(frame).collect::<PyResult<Vec<Frame>>>()?;
-        self.work(py, progress, time_s.rows, |state, work| {
+        self.work(py, progress, &time_s, |state, work| {
             for (row, frame) in frames.iter().enumerate() {
                 let time = state.begin(time_s.values[row]);
                 state.driver.handle_frame(time, bus, frame);
@@ -164,10 +168,9 @@ impl Monitor {
 
     /// Continues at `time_s`, after a gap of unknown length.
     fn gap(&self, py: Python<'_>, time_s: f64) -> PyResult<Outputs> {
-        if !time_s.is_finite() {
-            return Err(data(format!("time_s = {time_s}, must be a finite number")));
-        }
+        check_time("time_s", time_s)?;
         let mut state = self.state.wait(py)?;
+        state.latest_s = time_s;
         state.driver.handle_unknown_gap(Timestamp::from_secs(time_s));
         state.finish(py, &self.interfaces)
     }
@@ -188,11 +191,13 @@ impl Monitor {
             interfaces: config.interface_names(),
             cells: sample.cells,
             is_pack_total: matches!(sample.voltage_source, VoltageSource::PackTotal { .. }),
+            limits: PlausibleRanges::new(sample),
             state: ExclusiveState::new(State {
                 driver,
                 columns: Columns::default(),
                 wanted,
                 cells: sample.cells.into(),
+                latest_s: f64::NEG_INFINITY,
             }),
         }
     }
@@ -209,12 +214,13 @@ impl Monitor {
         &self,
         py: Python<'_>,
         is_shown: bool,
-        rows: usize,
+        time_s: &Reals,
         take: impl FnOnce(&mut State, &BackgroundTask) + Send,
     ) -> PyResult<Outputs> {
-        let progress = Progress { is_shown, total: Some(rows as u64), unit: "row" };
+        let progress = Progress { is_shown, total: Some(time_s.rows as u64), unit: "row" };
         let mut turn = self.state.wait(py)?;
         let state: &mut State = &mut turn;
+        check_order(state.latest_s, &time_s.values)?;
         background_task::run(py, progress, |work| take(state, work))?;
         turn.finish(py, &self.interfaces)
     }
@@ -235,6 +241,7 @@ impl State {
     /// Begins an input at `time_s`. If its estimates would not become rows, they are not computed.
     fn begin(&mut self, time_s: f64) -> Timestamp {
         let time = Timestamp::from_secs(time_s);
+        self.latest_s = time_s;
         self.driver.out.want_estimates = self.columns.wants_estimates(self.wanted, time, self.cells);
         time
     }
@@ -299,13 +306,102 @@ fn report(row: usize, work: &BackgroundTask) {
     }
 }
 
-/// Converts times, which must be finite.
+/// Largest time (s) that is not taken for another unit. In seconds, it is the year 2262, where nanoseconds end.
+const MAX_TIME_S: f64 = 9.2e9;
+
+/// Converts times to seconds. `datetime64` becomes Unix time.
 fn times(time_s: &Bound<'_, PyAny>) -> PyResult<Reals> {
-    let time_s = arrays::column("time_s", time_s)?;
-    match time_s.values.iter().position(|time_s| !time_s.is_finite()) {
-        Some(row) => Err(data(format!("time_s[{row}] = {}, must be a finite number", time_s.values[row]))),
-        None => Ok(time_s),
+    let time_s = arrays::seconds("time_s", time_s)?;
+    for (row, time_s) in time_s.values.iter().enumerate() {
+        check_time(format_args!("time_s[{row}]"), *time_s)?;
     }
+    Ok(time_s)
+}
+
+/// Checks that a time is a finite number of seconds. A Unix time in another unit gives an error that names the unit.
+fn check_time(name: impl std::fmt::Display, time_s: f64) -> PyResult<()> {
+    if time_s.abs() <= MAX_TIME_S {
+        return Ok(());
+    }
+    // Unix times from 1973 to 5138; the ranges of the three units do not overlap.
+    let units =
+        [(1e11, 1e14, "milliseconds", "1e3"), (1e14, 1e17, "microseconds", "1e6"), (1e17, 1e20, "nanoseconds", "1e9")];
+    let unit = units.iter().find(|(low, high, ..)| (*low..*high).contains(&time_s));
+    let hint = unit.map_or(String::new(), |(.., unit, divisor)| format!(": probably {unit}, divide by {divisor}"));
+    let allowed = if time_s.is_finite() { "seconds, at most 9.2e9" } else { "a finite number" };
+    Err(data(format!("{name} = {time_s}, must be {allowed}{hint}")))
+}
+
+/// Checks that the times do not run backwards.
+fn check_order(latest_s: f64, times_s: &[f64]) -> PyResult<()> {
+    let mut before = latest_s;
+    for (row, &time_s) in times_s.iter().enumerate() {
+        if time_s < before {
+            let of =
+                if row == 0 { "the latest time of the call before".to_owned() } else { format!("time_s[{}]", row - 1) };
+            return Err(data(format!("time_s[{row}] = {time_s}, must not be before {of} = {before}")));
+        }
+        before = time_s;
+    }
+    Ok(())
+}
+
+/// Configured ranges of plausible readings: smallest and largest value.
+#[derive(Debug, Clone, Copy)]
+struct PlausibleRanges {
+    current_a: (f64, f64),
+    voltage_v: (f64, f64),
+    temperature_c: (f64, f64),
+}
+
+impl PlausibleRanges {
+    fn new(sample: &SampleConfig) -> Self {
+        let range = |limits: &Limits| (limits.min, limits.max);
+        let (low, high) = range(&sample.voltage);
+        let cells = match sample.voltage_source {
+            VoltageSource::PackTotal { series } => f64::from(series),
+            VoltageSource::Cells => 1.0,
+        };
+        let voltage_v = (low * cells, high * cells);
+        Self { current_a: range(&sample.current), voltage_v, temperature_c: range(&sample.temperature) }
+    }
+
+    /// Checks that the values are not in another unit.
+    fn check(&self, input: &RowInput) -> PyResult<()> {
+        check_unit("current_a", &input.current_a, self.current_a, &OtherUnit::MILLIAMPERE)?;
+        check_unit("voltage_v", &input.voltage_v, self.voltage_v, &OtherUnit::MILLIVOLT)?;
+        let kelvin = |of: &Reals| check_unit("temperature_c", of, self.temperature_c, &OtherUnit::KELVIN);
+        input.temperature_c.as_ref().map_or(Ok(()), kelvin)
+    }
+}
+
+/// A unit that readings may have by mistake.
+struct OtherUnit {
+    /// The expected unit.
+    expected: &'static str,
+    /// The other unit, and how to convert it.
+    remedy: &'static str,
+    converted: fn(f64) -> f64,
+}
+
+impl OtherUnit {
+    const MILLIAMPERE: Self = Self { expected: "A", remedy: "mA: divide by 1000", converted: |value| value / 1000.0 };
+    const MILLIVOLT: Self = Self { expected: "V", remedy: "mV: divide by 1000", converted: |value| value / 1000.0 };
+    const KELVIN: Self =
+        Self { expected: "degrees C", remedy: "K: subtract 273.15", converted: |value| value - 273.15 };
+}
+
+/// Returns an error if most values are plausible only in another unit.
+fn check_unit(name: &str, found: &Reals, (low, high): (f64, f64), other: &OtherUnit) -> PyResult<()> {
+    let is_plausible = |value: f64| (low..=high).contains(&value);
+    let is_other = |value: &f64| !is_plausible(*value) && is_plausible((other.converted)(*value));
+    let known = found.values.iter().filter(|value| value.is_finite()).count();
+    if 2 * found.values.iter().filter(|value| is_other(value)).count() <= known {
+        return Ok(());
+    }
+    let first = found.values.iter().position(is_other).unwrap_or_default();
+    let (place, value) = (found.index(first), found.values[first]);
+    Err(data(format!("{name}{place} = {value}, must be {low} to {high} {}: probably {}", other.expected, other.remedy)))
 }
 
 fn frame(row: usize, id: u32, payload: &[u8], length: usize) -> PyResult<Frame> {

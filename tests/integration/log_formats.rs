@@ -62,9 +62,12 @@ fn drive_in_other_formats_gives_same_estimates() {
     let expected = estimates(folder, example("drive.log").to_str().unwrap());
     assert!(expected.lines().count() > 1000, "{expected}");
     let logs = [
-        write(folder, "a.log", "date Tue Nov 14 10:13:20.000 pm 2023\nbase hex  timestamps absolute\n", |us, id, bytes| {
-            format!("   {} 1  {id}             Rx   d 8 {bytes}", seconds(us))
-        }),
+        write(
+            folder,
+            "a.log",
+            "date Tue Nov 14 10:13:20.000 pm 2023\nbase hex  timestamps absolute\n",
+            |us, id, bytes| format!("   {} 1  {id}             Rx   d 8 {bytes}", seconds(us)),
+        ),
         write(folder, "b.csv", "Time Stamp,ID,Extended,Dir,Bus,LEN,D1,D2,D3,D4,D5,D6,D7,D8\n", |us, id, bytes| {
             format!("{},00000{id},false,Rx,0,8,{}", START_US + us, bytes.replace(' ', ","))
         }),

@@ -32,6 +32,7 @@ mod e2e_peer;
 mod examples;
 #[cfg(feature = "lab")]
 mod export_cli;
+mod field_definitions;
 mod fit_cli;
 mod fit_logs;
 mod fit_logs_bad;

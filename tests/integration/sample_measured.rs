@@ -19,6 +19,7 @@ fn config() -> SampleConfig {
         temperature: limits(-40.0, 85.0),
         reported_soc: None,
         reported_soh: None,
+        direction: None,
         contactor: None,
         sensor_of_cell: vec![Some(SensorIndex(0))],
         ambient_c: 24.0,

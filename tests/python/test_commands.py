@@ -1,5 +1,6 @@
 """The Python functions of the commands give the same bytes and files as the commands, and exceptions with the same text."""
 
+import errno
 import json
 import subprocess
 
@@ -190,7 +191,10 @@ def test_error_text_equals_command(tmp_path, monkeypatch, kind, bases, call, com
     assert done.returncode == (78 if kind is pw.ConfigError else 1) and done.stdout == ""
     with pytest.raises(kind) as caught:
         call(type(tmp_path)())
-    assert type(caught.value) is kind and f"{caught.value}\n" == done.stderr != "\n"
+    expected = done.stderr.replace("--branches", "branches").replace("--soc-nodes", "soc_nodes")
+    assert isinstance(caught.value, kind) and f"{caught.value}\n" == expected != "\n"
+    if kind is pw.FileError:
+        assert isinstance(caught.value, FileNotFoundError) and caught.value.errno == errno.ENOENT
     assert issubclass(kind, bases) and issubclass(kind, pw.PackwatchError)
     if kind is pw.ConfigError:
         assert caught.value.faults == str(caught.value).splitlines()
@@ -203,8 +207,28 @@ def test_error_text_omits_origin(tmp_path):
         pw.read(path)
     (tmp_path / "folder.csv").mkdir()
     for call in (pw.read, lambda path: pw.replay(PAPER, path), pw.gp.load):
-        with pytest.raises(pw.FileError, match="folder.csv: .*Is a directory"):
+        with pytest.raises(pw.FileError, match="folder.csv: .*Is a directory") as caught:
             call(tmp_path / "folder.csv")
+        assert caught.value.errno == errno.EISDIR and not isinstance(caught.value, FileNotFoundError)
+
+
+def test_control_bytes_are_escaped_in_exceptions(tmp_path):
+    path = tmp_path / "\x1b[31m.csv"
+    path.write_text(CSV_FAULT)
+    with pytest.raises(pw.DataError) as caught:
+        pw.read(path)
+    assert "\x1b" not in str(caught.value) and r"\u{1b}[31m.csv:3" in str(caught.value)
+    with pytest.raises(pw.DataError) as caught:
+        pw.Monitor(PAPER).frames([0.0], [1], [[1]], interface="\x07")
+    assert "\x07" not in str(caught.value)
+
+
+def test_soc_of_impossible_voltage_is_rejected():
+    model = pw.CellModel(CELL)
+    assert 1.0 <= model.soc_of_ocv(model.voltage_max_v + 0.01) <= 1.1
+    for voltage_v, text in [(9.0, "must be near"), (0.0, "must be near"), (3700.0, "V: probably mV")]:
+        with pytest.raises(pw.DataError, match=f"voltage_v = {voltage_v:g}, must be .*{text.split()[-1]}"):
+            model.soc_of_ocv(voltage_v)
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 that names the fault."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -229,6 +230,54 @@ def test_bad_input_names_its_fault(call, text):
     with pytest.raises(pw.DataError) as caught:
         call(pw.Monitor(PAPER))
     assert text in str(caught.value) and isinstance(caught.value, ValueError)
+
+
+UNIX_S = 1_700_000_000
+
+
+def test_datetimes_are_unix_times(record):
+    seconds = record.time_s[:600] + UNIX_S
+    expected = pw.Monitor(PAPER).rows(seconds, record.current_a[:600], record.voltage_v[:600]).estimates
+    since = np.timedelta64(1, "ms") * np.round(record.time_s[:600] * 1000).astype(int)
+    for unit in ("ms", "us", "ns"):
+        stamps = np.datetime64(UNIX_S, "s").astype(f"datetime64[{unit}]") + since
+        for given in (stamps, pd.Series(stamps), pd.DatetimeIndex(stamps)):
+            found = pw.Monitor(PAPER).rows(given, record.current_a[:600], record.voltage_v[:600]).estimates
+            np.testing.assert_allclose(found["time_s"], expected["time_s"], rtol=0, atol=1e-6)
+            np.testing.assert_allclose(found["soc"], expected["soc"], rtol=0, atol=1e-6)
+    with pytest.raises(pw.DataError, match=r"time_s\[1\] = NaN, must be a finite number"):
+        pw.Monitor(PAPER).rows(np.array(["2026-01-01", "NaT"], "datetime64[s]"), [0, 0], [3.9, 3.9])
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1e3, "milliseconds, divide by 1e3"), (1e6, "microseconds, divide by 1e6"), (1e9, "nanoseconds, divide by 1e9")])
+def test_time_in_other_unit_names_the_unit(record, factor, unit):
+    time_s = (record.time_s + UNIX_S) * factor
+    with pytest.raises(pw.DataError, match=rf"time_s\[0\] = 1.*, must be seconds, at most 9.2e9: probably {unit}"):
+        pw.Monitor(PAPER).rows(time_s, record.current_a, record.voltage_v)
+    with pytest.raises(pw.DataError, match=unit):
+        pw.Monitor(PAPER).gap(time_s[0])
+
+
+def test_time_running_backwards_is_rejected_before_first_row(record):
+    monitor, (time_s, current_a, voltage_v) = pw.Monitor(PAPER), columns(record)
+    with pytest.raises(pw.DataError, match=r"time_s\[2\] = 1, must not be before time_s\[1\] = 3"):
+        monitor.rows([0.0, 3.0, 1.0], [1.0] * 3, [3.9] * 3)
+    soc = monitor.rows(time_s[:700], current_a[:700], voltage_v[:700]).estimates["soc"]
+    np.testing.assert_array_equal(soc, pw.Monitor(PAPER).rows(time_s[:700], current_a[:700], voltage_v[:700]).estimates["soc"])
+    with pytest.raises(pw.DataError, match=r"time_s\[0\] = .*, must not be before the latest time of the call before = "):
+        monitor.rows(time_s[:10], current_a[:10], voltage_v[:10])
+
+
+def test_readings_in_other_unit_name_the_unit(record):
+    time_s, current_a, voltage_v = columns(record)
+    for given, text in [
+        ((current_a, voltage_v * 1000), "voltage_v[0] = "),
+        ((np.full_like(current_a, 2600.0), voltage_v), "current_a[0] = 2600, must be "),
+        ((current_a, voltage_v, np.full_like(current_a, 298.0)), "temperature_c[0] = 298, must be "),
+    ]:
+        with pytest.raises(pw.DataError) as caught:
+            pw.Monitor(PAPER).rows(time_s, *given)
+        assert text in str(caught.value) and re.search(": probably (mV|mA|K): ", str(caught.value))
 
 
 def test_monitor_continues_unchanged_after_fault(record):

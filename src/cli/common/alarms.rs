@@ -1,7 +1,7 @@
 //! Converts alarms to table rows. If many cells have the same alarm, the alarms share one row, which shows the number
 //! of cells, the list of cells and the worst value.
 
-use crate::alarm::{Alarm, Direction, Rule, Unit};
+use crate::alarm::{Alarm, Direction};
 use crate::quantity::CellIndex;
 
 /// If at least this many cells have the same alarm, their alarms share a row.
@@ -96,22 +96,10 @@ pub(crate) fn cell(cell: Option<CellIndex>) -> String {
     cell.map_or_else(|| "pack".to_owned(), |cell| (u32::from(cell.0) + 1).to_string())
 }
 
-/// Formats a value of a rule with its unit. Fractions are shown as percentages.
-pub(crate) fn with_unit(rule: Rule, value: f64) -> String {
-    let unit = rule.spec().unit;
-    match unit {
-        Unit::Fraction => format!("{:.1} %", 100.0 * value),
-        Unit::FractionPerDay => format!("{:.3} %/d", 100.0 * value),
-        Unit::Ratio => format!("{value:.2}"),
-        Unit::AmpereHours => format!("{value:.3} {}", unit.symbol()),
-        Unit::Seconds | Unit::Celsius | Unit::Cycles => format!("{value:.1} {}", unit.symbol()),
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::alarm::{AlarmState, Severity};
+    use crate::alarm::{AlarmState, Rule, Severity};
 
     fn alarm(rule: Rule, cell: Option<u16>, value: f64) -> Alarm {
         Alarm {

@@ -5,16 +5,21 @@ use std::path::Path;
 use packwatch_host::failure::Failure;
 
 use super::output::named;
-use crate::can::dbc::Database;
+use crate::can::dbc::{Database, DbcError};
 
 /// Maximum size of a text file, bytes. The largest known signal set has 0.5 MB.
 const MAX_BYTES: u64 = 64 << 20;
 
-/// Reads a DBC file.
+/// Reads a DBC file. Prints a warning for each message that is left out.
 pub(crate) fn database(file: &Path) -> Result<Database, Failure> {
     let bytes = std::fs::read(file).map_err(|error| unreadable(file, &error))?;
-    Database::parse_bytes(&bytes)
-        .map_err(|error| Failure::new(format!("{}:{}: {}", file.display(), error.line, error.what)))
+    let at = |fault: &DbcError| format!("{}:{}", file.display(), fault.line);
+    let database =
+        Database::parse_bytes(&bytes).map_err(|fault| Failure::new(format!("{}: {}", at(&fault), fault.what)))?;
+    for fault in &database.left_out {
+        eprintln!("{}: warning: {}", at(fault), fault.what);
+    }
+    Ok(database)
 }
 
 /// Reads a text file of at most [`MAX_BYTES`].

@@ -3,6 +3,8 @@
 //! Tables and documents are written to the given writer or to standard output. If the reader closes standard output
 //! early (`| head`), the command still succeeds.
 
+pub(crate) use crate::io::event_log::word;
+
 use std::fmt::Display;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
@@ -36,14 +38,6 @@ pub(crate) fn unless_closed(written: io::Result<()>) -> Result<(), Failure> {
 pub(crate) fn print(text: &str) -> Result<(), Failure> {
     let written = io::stdout().write_all(text.as_bytes());
     unless_closed(written).map_err(|failure| Failure::new(format!("standard output: {}", failure.message)))
-}
-
-/// Name of an enumeration value, as in JSON.
-pub(crate) fn word(value: impl serde::Serialize) -> String {
-    match serde_json::to_value(value) {
-        Ok(serde_json::Value::String(word)) => word,
-        _ => "?".to_owned(),
-    }
 }
 
 /// Writes one JSON document to standard output.

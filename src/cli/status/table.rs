@@ -3,7 +3,7 @@
 use std::fmt::Write as _;
 
 use super::{config, duration, in_brackets, mean, number, shown, soc_band, store, with_std, word};
-use crate::cli::common::alarms::{AlarmGroup, grouped, with_unit};
+use crate::cli::common::alarms::{AlarmGroup, grouped};
 use crate::cli::common::output;
 use crate::io::stamp;
 use crate::monitor::{CellView, ModelState, PackView};
@@ -182,7 +182,7 @@ fn alarms(text: &mut String, document: &StatusDocument) {
 /// Formats an alarm, or an alarm that many cells share, in a line.
 pub(super) fn alarm_line(group: &AlarmGroup) -> String {
     let alarm = &group.alarm;
-    let value = alarm.value.map_or_else(|| "unknown".to_owned(), |value| with_unit(alarm.rule, value));
+    let value = alarm.value.map_or_else(|| "unknown".to_owned(), |value| alarm.rule.with_unit(value));
     let probability =
         alarm.probability.map_or_else(String::new, |probability| format!(", {:.0} % sure", 100.0 * probability));
     let owner = group.owner();
@@ -191,7 +191,7 @@ pub(super) fn alarm_line(group: &AlarmGroup) -> String {
         alarm.severity.name(),
         alarm.rule.name(),
         word(alarm.state),
-        with_unit(alarm.rule, alarm.threshold),
+        alarm.rule.with_unit(alarm.threshold),
         if alarm.is_acknowledged { ", acknowledged" } else { "" },
     )
 }

@@ -150,6 +150,18 @@ impl Rule {
         Self::ALL.into_iter().find(|rule| *rule as u8 == number)
     }
 
+    /// Formats a value of the rule with its unit. Fractions are shown as percentages.
+    pub fn with_unit(self, value: f64) -> String {
+        let unit = self.spec().unit;
+        match unit {
+            Unit::Fraction => format!("{:.1} %", 100.0 * value),
+            Unit::FractionPerDay => format!("{:.3} %/d", 100.0 * value),
+            Unit::Ratio => format!("{value:.2}"),
+            Unit::AmpereHours => format!("{value:.3} {}", unit.symbol()),
+            Unit::Seconds | Unit::Celsius | Unit::Cycles => format!("{value:.1} {}", unit.symbol()),
+        }
+    }
+
     /// The name in configurations, events and on the command line.
     pub const fn name(self) -> &'static str {
         match self {

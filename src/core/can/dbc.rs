@@ -5,8 +5,9 @@
 //! codes of multiplexors. [`Database::to_dbc`] writes a database as text, and parsing this text gives an equal
 //! database.
 //!
-//! The parser returns a [`DbcError`] with the line in four cases: the file is not a DBC, a number is out of range or
-//! not finite, a name is defined twice, or multiplexing cannot be resolved. It accepts a signal that extends beyond its
+//! The parser leaves out a message, and keeps a [`DbcError`] with its line, in four cases: its text does not follow the
+//! grammar, a number is out of range or not finite, a name is defined twice, or multiplexing cannot be resolved. A text
+//! that does not follow the grammar and has no usable message is an error. The parser accepts a signal that extends beyond its
 //! message. If a frame has the message's length, decoding this signal gives
 //! [`Fault::ShortFrame`](crate::quantity::Fault::ShortFrame). The parser also accepts an invalid layout, which
 //! [`SignalLayout::plan`] rejects.
@@ -19,12 +20,20 @@ use crate::can::secoc::Authentication;
 use crate::can::signal::{ByteOrder, SignalLayout, ValueType};
 
 mod attributes;
+mod statements;
 mod write;
+
+/// Name of the pseudo message in which editors keep signals without a message.
+const PSEUDO_MESSAGE: &str = "VECTOR__INDEPENDENT_SIG_MSG";
+
+/// Maximum number of left-out messages and statements that are listed one by one. A file with more is probably not a
+/// DBC, and more lines are not read.
+const MAX_LISTED: usize = 20;
 
 /// Maximum nesting of multiplexors; deeper nesting counts as a loop.
 const MAX_MULTIPLEX_DEPTH: usize = 8;
 
-/// Reason why a text is not a usable DBC.
+/// Reason why a text is not a usable DBC, or why a part of it is left out.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("line {line}: {what}")]
 pub struct DbcError {
@@ -42,6 +51,9 @@ pub struct Database {
     /// Comment on the whole database (`CM_`).
     pub comment: Option<String>,
     pub messages: Vec<Message>,
+    /// Messages and statements of the text that are not usable and therefore left out, sorted by line; the last entry
+    /// counts those beyond 20.
+    pub left_out: Vec<DbcError>,
 }
 
 /// Kind of frame that carries a message.
@@ -81,6 +93,8 @@ pub struct Message {
     pub sender: Option<String>,
     /// Kind of frame (`VFrameFormat` and `CANFD_BRS`).
     pub format: FrameFormat,
+    /// Whether the identifier stands for a J1939 parameter group, which any source address may send (`VFrameFormat`).
+    pub is_j1939: bool,
     /// End-to-end protection (`E2EProfile` and `E2EDataId`, packwatch's own attributes).
     pub e2e: Option<Protection>,
     /// Authentication (`SecOCProfile` and `SecOCDataId`, packwatch's own attributes).
@@ -126,25 +140,30 @@ pub struct MuxCondition {
 }
 
 impl Database {
-    /// Parses the text of a DBC.
+    /// Parses the text of a DBC. Messages and statements that are not usable are left out and listed in
+    /// [`Self::left_out`].
     ///
     /// # Errors
-    /// Returns the first fault with its line.
+    /// Returns the first fault with its line if the text does not follow the grammar and has no usable message.
     pub fn parse(text: &str) -> Result<Self, DbcError> {
         let text = text.strip_prefix('\u{feff}').unwrap_or(text);
         // The grammar requires a line end after every statement.
         let closed = if text.ends_with('\n') { text.to_owned() } else { format!("{text}\n") };
-        check_identifiers(&closed)?;
-        let dbc = can_dbc::Dbc::try_from(closed.as_str()).map_err(|error| grammar_fault(&error))?;
-        let details = DetailTable::new(&dbc);
-        // Editors keep signals without a message in this pseudo message.
-        let messages = dbc.messages.iter().filter(|message| message.name != "VECTOR__INDEPENDENT_SIG_MSG");
-        let messages: Result<Vec<_>, _> =
-            messages.map(|message| read_message(&dbc, &details, message).map_err(|f| f.at(&closed))).collect();
+        let mut left_out = Vec::new();
+        let (dbc, is_dbc) = statements::parse(&closed, &mut left_out)?;
+        let messages = read_messages(&dbc, &closed, &mut left_out);
+        left_out.sort_by_key(|fault| fault.line);
+        if let (Some(fault), true) = (left_out.first(), messages.is_empty() && !is_dbc) {
+            return Err(fault.clone());
+        }
+        if let Some(next) = left_out.get(MAX_LISTED) {
+            let what = format!("{} more messages or statements from here on are left out", left_out.len() - MAX_LISTED);
+            let rest = DbcError { line: next.line, what };
+            left_out.truncate(MAX_LISTED);
+            left_out.push(rest);
+        }
         let nodes = dbc.nodes.iter().map(|node| node.0.clone()).collect();
-        let database = Self { nodes, comment: plain_comment(&dbc), messages: messages? };
-        database.check_names().map_err(|fault| fault.at(&closed))?;
-        Ok(database)
+        Ok(Self { nodes, comment: plain_comment(&dbc), messages, left_out })
     }
 
     /// Parses the bytes of a DBC file: UTF-8 (with or without a byte-order mark), or Latin-1 if they are not valid
@@ -176,22 +195,6 @@ impl Database {
         let message = self.message(message)?;
         Some((message, message.signal(signal)?))
     }
-
-    fn check_names(&self) -> Result<(), MessageFault> {
-        let mut messages = HashSet::new();
-        for Message { name, signals, .. } in &self.messages {
-            if !messages.insert(name) {
-                let what = format!("message {name} is defined twice, names must be unique");
-                return Err(MessageFault { message: name.clone(), signal: None, what });
-            }
-            let mut names = HashSet::new();
-            if let Some(twice) = signals.iter().find(|signal| !names.insert(&signal.name)) {
-                let what = format!("signal {name}.{} is defined twice", twice.name);
-                return Err(MessageFault { message: name.clone(), signal: Some(twice.name.clone()), what });
-            }
-        }
-        Ok(())
-    }
 }
 
 /// Whether the bytes start with a UTF-16 byte-order mark, or with a Latin letter in UTF-16.
@@ -221,20 +224,22 @@ impl Signal {
 
 /// A fault of a message or signal, before the line of the fault is known.
 struct MessageFault {
+    /// Number of the message in the DBC.
+    id: u32,
     message: String,
     signal: Option<String>,
     what: String,
 }
 
 impl MessageFault {
-    /// Adds the line of the last definition of the message or signal.
+    /// Adds the line of the last definition of the message or signal, and states that the message is left out.
     fn at(self, text: &str) -> DbcError {
         let (mut line, mut inside) = (1, false);
         for (number, content) in (1..).zip(text.lines()) {
             let mut words = content.split([' ', '\t', ':']).filter(|word| !word.is_empty());
             match (words.next(), words.next(), words.next()) {
-                (Some("BO_"), _, Some(name)) => {
-                    inside = name == self.message;
+                (Some("BO_"), Some(id), Some(name)) => {
+                    inside = name == self.message && id.parse() == Ok(self.id);
                     if inside {
                         line = number;
                     }
@@ -243,44 +248,8 @@ impl MessageFault {
                 _ => {}
             }
         }
-        DbcError { line, what: self.what }
+        DbcError { line, what: format!("message {} is left out: {}", self.message, self.what) }
     }
-}
-
-fn grammar_fault(error: &can_dbc::DbcError) -> DbcError {
-    match error {
-        can_dbc::DbcError::Pest(error) => {
-            // The report's last line states what was expected; the lines before it show the position.
-            let report = error.to_string();
-            let expected = report.lines().rev().find_map(|line| line.trim().strip_prefix("= "));
-            let expected = match expected {
-                None | Some("expected file") => "must be a statement of a DBC file, such as VERSION or BO_".to_owned(),
-                Some(expected) => expected.replace('_', " "),
-            };
-            let line = error_line(&report);
-            DbcError { line, what: format!("found \"{}\", {expected}", error.line().trim()) }
-        }
-        other => DbcError { line: 1, what: other.to_string() },
-    }
-}
-
-/// The line number in pest's report, which starts with ` --> line:column`.
-fn error_line(report: &str) -> usize {
-    let place = report.lines().next().and_then(|first| first.split("--> ").nth(1));
-    place.and_then(|place| place.split(':').next()).and_then(|line| line.trim().parse().ok()).unwrap_or(1)
-}
-
-/// Checks that identifiers without the extended bit have 11 bits, because the grammar crate would drop the higher bits.
-fn check_identifiers(text: &str) -> Result<(), DbcError> {
-    for (line, content) in (1..).zip(text.lines()) {
-        let Some(rest) = content.trim_start().strip_prefix("BO_ ") else { continue };
-        let Some(Ok(id)) = rest.split_whitespace().next().map(str::parse::<u64>) else { continue };
-        if id > 0x7FF && id & 0x8000_0000 == 0 || id > 0xFFFF_FFFF {
-            let what = format!("identifier {id}, must be 0 to 2047, or have bit 31 set for an extended one");
-            return Err(DbcError { line, what });
-        }
-    }
-    Ok(())
 }
 
 /// Properties of a signal that are stated outside its `SG_` definition.
@@ -327,20 +296,49 @@ impl<'a> DetailTable<'a> {
     }
 }
 
+/// The usable messages, in the file's order. If several messages have one name, the first is used.
+fn read_messages(dbc: &can_dbc::Dbc, text: &str, left_out: &mut Vec<DbcError>) -> Vec<Message> {
+    let details = DetailTable::new(dbc);
+    let mut names = HashSet::new();
+    let mut messages = Vec::new();
+    for message in dbc.messages.iter().filter(|message| message.name != PSEUDO_MESSAGE) {
+        match read_message(dbc, &details, message) {
+            Ok(_) if !names.insert(&message.name) => {
+                let what = "the name is defined twice, names must be unique".to_owned();
+                left_out.push(
+                    MessageFault { id: message.id.raw(), message: message.name.clone(), signal: None, what }.at(text),
+                );
+            }
+            Ok(message) => messages.push(message),
+            Err(fault) => left_out.push(fault.at(text)),
+        }
+    }
+    messages
+}
+
 fn read_message<'a>(
     dbc: &'a can_dbc::Dbc,
     details: &DetailTable<'a>,
     message: &'a can_dbc::Message,
 ) -> Result<Message, MessageFault> {
-    let fault = |what: String| MessageFault { message: message.name.clone(), signal: None, what };
+    let fault = |signal: Option<&str>, what: String| MessageFault {
+        id: message.id.raw(),
+        message: message.name.clone(),
+        signal: signal.map(str::to_owned),
+        what,
+    };
+    let mut names = HashSet::new();
+    if let Some(twice) = message.signals.iter().find(|signal| !names.insert(&signal.name)) {
+        return Err(fault(Some(&twice.name), format!("signal {} is defined twice", twice.name)));
+    }
     let id = match message.id {
         can_dbc::MessageId::Standard(id) => CanId::standard(u32::from(id)),
         can_dbc::MessageId::Extended(id) => CanId::extended(id),
     };
-    let id = id.ok_or_else(|| fault(format!("message {}: identifier out of range", message.name)))?;
+    let id = id.ok_or_else(|| fault(None, "the identifier is out of range".to_owned()))?;
     // A length above 64 bytes is kept: J1939 DBCs describe transport messages of up to 1,785 bytes.
-    let len_bytes = u16::try_from(message.size)
-        .map_err(|_| fault(format!("message {}: length {}, must be 0 to 65535", message.name, message.size)))?;
+    let len_bytes =
+        u16::try_from(message.size).map_err(|_| fault(None, format!("length {}, must be 0 to 65535", message.size)))?;
     let signals: Result<Vec<_>, _> =
         message.signals.iter().map(|signal| read_signal(details, message, signal)).collect();
     Ok(Message {
@@ -349,6 +347,7 @@ fn read_message<'a>(
         len_bytes,
         sender: message.transmitter.clone(),
         format: attributes::format(dbc, message.id),
+        is_j1939: attributes::is_j1939(dbc, message.id),
         e2e: attributes::e2e(dbc, message.id),
         secoc: attributes::secoc(dbc, message.id),
         signals: signals?,
@@ -371,9 +370,10 @@ fn read_signal<'a>(
     signal: &'a can_dbc::Signal,
 ) -> Result<Signal, MessageFault> {
     let fault = |what: String| MessageFault {
+        id: message.id.raw(),
         message: message.name.clone(),
         signal: Some(signal.name.clone()),
-        what: format!("signal {}.{}: {what}", message.name, signal.name),
+        what: format!("signal {}: {what}", signal.name),
     };
     let finite = |name: &str, value: f64| {
         if value.is_finite() { Ok(value) } else { Err(fault(format!("{name} {value}, must be finite"))) }

@@ -6,6 +6,9 @@
 //! fault. A message is identified by its interface, its identifier, and whether the identifier is standard or extended.
 
 mod message_table;
+mod parameter_groups;
+
+pub use parameter_groups::ParameterGroups;
 
 use message_table::MessageTable;
 
@@ -37,6 +40,8 @@ impl MuxTest {
 pub struct Binding {
     pub bus: BusIndex,
     pub id: CanId,
+    /// Whether frames of the same J1939 parameter group carry the message, whatever their source address and priority.
+    pub of_any_source: bool,
     /// Payload length in the DBC, bytes. Used to encode frames, not to decode them.
     pub len_bytes: u16,
     pub plan: SignalPlan,
@@ -53,6 +58,9 @@ pub struct Binding {
     pub not_available: Vec<u64>,
     /// Allowed values after scale and offset, ends included.
     pub range: (f64, f64),
+    /// Values that mean charging, for [`Channel::CurrentDirection`]: the reading is -1 for these values, 1 for all
+    /// others. Empty = the reading is the value.
+    pub charge: Vec<f64>,
 }
 
 impl Binding {
@@ -69,6 +77,7 @@ impl Binding {
         Ok(Self {
             bus,
             id: message.id,
+            of_any_source: false,
             len_bytes: message.len_bytes,
             plan: signal.layout.plan()?,
             mux: selectors.collect::<Result<_, _>>()?,
@@ -77,6 +86,7 @@ impl Binding {
             offset: 0.0,
             not_available: signal.not_available_codes(),
             range: (f64::NEG_INFINITY, f64::INFINITY),
+            charge: Vec::new(),
         })
     }
 
@@ -103,7 +113,14 @@ impl Binding {
             return Err(Fault::NotAvailable);
         }
         let value = self.plan.decode(payload)? * self.scale + self.offset;
-        if value >= self.range.0 && value <= self.range.1 { Ok(value) } else { Err(Fault::OutOfRange) }
+        if !(self.range.0..=self.range.1).contains(&value) {
+            return Err(Fault::OutOfRange);
+        }
+        Ok(match self.charge.as_slice() {
+            [] => value,
+            charge if charge.contains(&value) => -1.0,
+            _ => 1.0,
+        })
     }
 }
 
@@ -113,13 +130,14 @@ pub struct InputMap {
     /// The bindings, sorted by message, then channel.
     bindings: Vec<Binding>,
     messages: MessageTable,
+    groups: ParameterGroups,
 }
 
 impl InputMap {
     /// Creates the map; sorts the bindings by message and channel.
     pub fn new(mut bindings: Vec<Binding>) -> Self {
         bindings.sort_by_key(|binding| (binding.bus, binding.id, binding.channel));
-        Self { messages: MessageTable::new(&bindings), bindings }
+        Self { messages: MessageTable::new(&bindings), groups: ParameterGroups::new(&bindings), bindings }
     }
 
     /// Passes the readings of one frame to `each`, in the order of [`Channel`]. Multiplexed signals that are absent
@@ -142,6 +160,11 @@ impl InputMap {
     /// Identifiers configured on an interface, ascending, for kernel filters.
     pub fn ids(&self, bus: BusIndex) -> Vec<CanId> {
         self.messages().filter(|(other, ..)| *other == bus).map(|(_, id, _)| id).collect()
+    }
+
+    /// The messages that frames of any source address carry.
+    pub fn groups(&self) -> &ParameterGroups {
+        &self.groups
     }
 
     /// Every configured channel in ascending order.

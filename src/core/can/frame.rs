@@ -133,6 +133,12 @@ impl Frame {
         Self { id, kind: FrameKind::Classic, len: 0, data: Data([0; MAX_DATA]) }
     }
 
+    /// The same frame with another identifier.
+    #[must_use]
+    pub const fn with_id(&self, id: CanId) -> Self {
+        Self { id, ..*self }
+    }
+
     fn build(id: CanId, kind: FrameKind, bytes: &[u8]) -> Self {
         let mut data = [0; MAX_DATA];
         data[..bytes.len()].copy_from_slice(bytes);

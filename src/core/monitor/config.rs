@@ -220,7 +220,8 @@ impl MonitorConfig {
     /// Patterns of further identifiers (extended, 29 bits) to receive on an interface: identifier and mask.
     pub fn wanted_patterns(&self, bus: BusIndex) -> Vec<(u32, u32)> {
         let node = self.j1939.iter().filter(|j1939| j1939.bus == bus);
-        node.flat_map(|j1939| Node::new(&j1939.node).wanted()).collect()
+        let of_node = node.flat_map(|j1939| Node::new(&j1939.node).wanted());
+        of_node.chain(self.input.groups().patterns(bus)).collect()
     }
 
     /// Authentications of the command frame and of all sent frames.
@@ -259,6 +260,7 @@ impl MonitorConfig {
             ("[[input.temperature]]", old_sample.sensor_of_cell == new_sample.sensor_of_cell),
             ("[input.reported_soc] and [input.reported_soh]", reported(old_sample) == reported(new_sample)),
             ("[input.contactor]", old_sample.contactor.is_some() == new_sample.contactor.is_some()),
+            ("input.current.sign", old_sample.direction.is_some() == new_sample.direction.is_some()),
             ("[input]", self.input == new.input && self.answers == new.answers),
             ("[commands]", buses().all(|bus| self.listened_ids(bus) == new.listened_ids(bus))),
             ("[commands] and [output]: secoc", self.authentications() == new.authentications()),

@@ -152,6 +152,8 @@ impl Monitor {
     /// Handles a frame: passes its readings to the stages, or executes its command.
     fn handle_frame(&mut self, received: ReceivedFrame<'_>, out: &mut Outputs) {
         let Self { config, clock, intake, stages, .. } = self;
+        let configured = config.input.groups().configured(received.bus, received.frame);
+        let received = ReceivedFrame { frame: configured.as_ref().unwrap_or(received.frame), ..received };
         let ReceivedFrame { bus, frame, .. } = received;
         let now = clock.now;
         let Some(admission) = intake.admit(now, bus, frame, out) else { return };

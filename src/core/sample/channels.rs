@@ -15,6 +15,7 @@ pub(super) fn limits(config: &SampleConfig, channel: Channel) -> &Limits {
         | Channel::SupplyVoltage
         | Channel::Balancing(_)
         | Channel::PackIdentity => &config.voltage,
+        Channel::CurrentDirection => config.direction.as_ref().unwrap_or(&config.current),
         Channel::Contactor => config.contactor.as_ref().map_or(&config.voltage, |contactor| &contactor.limits),
         Channel::ReportedSoc => config.reported_soc.as_ref().unwrap_or(&config.voltage),
         Channel::ReportedSoh => config.reported_soh.as_ref().unwrap_or(&config.voltage),
@@ -32,6 +33,7 @@ pub(super) fn channels(config: &SampleConfig, sensors: usize) -> Vec<Channel> {
     }
     channels.extend(config.reported_soc.map(|_| Channel::ReportedSoc));
     channels.extend(config.reported_soh.map(|_| Channel::ReportedSoh));
+    channels.extend(config.direction.map(|_| Channel::CurrentDirection));
     channels.extend(config.contactor.as_ref().map(|_| Channel::Contactor));
     channels
 }
@@ -49,6 +51,7 @@ pub(super) fn should_move_s(channel: Channel, totals: &ChargeTotals) -> f64 {
         | Channel::SupplyVoltage
         | Channel::Balancing(_)
         | Channel::PackIdentity
+        | Channel::CurrentDirection
         | Channel::Contactor => 0.0,
     }
 }

@@ -58,6 +58,9 @@ pub struct SampleConfig {
     pub reported_soc: Option<Limits>,
     /// Limits of the SOH reported by the pack; `None` = not reported.
     pub reported_soh: Option<Limits>,
+    /// Limits of the direction of the current; `None` = the current has a sign of its own. While the direction is
+    /// unknown, so is the current.
+    pub direction: Option<Limits>,
     /// The contactors; `None` = no signal, so that the measured current always counts.
     pub contactor: Option<ContactorConfig>,
     /// Temperature sensor of each cell; `None` = no sensor, so that the thermal model gives the temperature.

@@ -167,6 +167,9 @@ impl Sampler {
         self.refresh_shared_inputs(time);
         let limits = limits(&self.config, channel);
         let mut value = reading.value.map(|value| value / self.divisor(channel));
+        if channel == Channel::Current && self.config.direction.is_some() {
+            value = value.and_then(|magnitude_a| Ok(magnitude_a * self.direction(time)?));
+        }
         if let (Channel::Current, Ok(current_a)) = (channel, value)
             && self.state.frozen.handle_current(time, current_a)
         {
@@ -199,7 +202,8 @@ impl Sampler {
                 self.shared.sensor = None;
                 None
             }
-            Channel::ReportedSoc
+            Channel::CurrentDirection
+            | Channel::ReportedSoc
             | Channel::ReportedSoh
             | Channel::SupplyVoltage
             | Channel::Balancing(_)
@@ -223,6 +227,19 @@ impl Sampler {
     /// Change of the pack current that exceeds the noise of the current sensor (A).
     pub fn flow_a(&self) -> f64 {
         self.flow_a
+    }
+
+    /// Direction of the current: 1 = discharge, -1 = charge.
+    ///
+    /// # Errors
+    /// The latest reading of the direction is bad or too old.
+    fn direction(&self, time: Timestamp) -> Result<f64, Fault> {
+        let limits = limits(&self.config, Channel::CurrentDirection);
+        let signal = self.slot(Channel::CurrentDirection).map(|slot| &self.state.signals[slot]);
+        signal
+            .filter(|signal| !signal.is_bad())
+            .and_then(|signal| signal.fresh(time, limits))
+            .ok_or(Fault::NotAvailable)
     }
 
     /// Handles the state of the contactors. While they are open, no current flows, regardless of the sensor.
@@ -558,7 +575,7 @@ impl Sampler {
             | (Channel::CellVoltage(_), VoltageSource::PackTotal { .. })
             // The monitor uses these channels; they are not sampled.
             | (Channel::SupplyVoltage | Channel::Balancing(_) | Channel::PackIdentity, _) => None,
-            (Channel::ReportedSoc | Channel::ReportedSoh | Channel::Contactor, _) => {
+            (Channel::ReportedSoc | Channel::ReportedSoh | Channel::CurrentDirection | Channel::Contactor, _) => {
                 let first = voltage + self.voltages;
                 let found = self.channels[first..].iter().position(|reported| *reported == channel)?;
                 Some(first + found)

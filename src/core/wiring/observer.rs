@@ -9,6 +9,7 @@ use super::evidence::usage::UsageRecord;
 use super::other_current::OtherCurrent;
 use super::plan::SignalPlan;
 use super::plan::{InterfacePlan, Plan, Witness};
+use crate::can::decode::{Binding, ParameterGroups};
 use crate::can::e2e::Status;
 use crate::can::guard::Guards;
 use crate::can::uds::{Answer, FrameOutcome, Listener, Question};
@@ -97,6 +98,11 @@ pub struct WiringObserver {
     /// For each other interface that carries the identifier of the configured current's message: statistics of the
     /// message.
     pub(crate) other_currents: BTreeMap<BusIndex, OtherCurrent>,
+    /// Messages that any J1939 source address may send.
+    groups: ParameterGroups,
+    /// Latest direction of a current that is sent as a magnitude, with its time: 1 = discharge, -1 = charge, `None` =
+    /// unknown. `None` until there is a reading.
+    direction: Option<(Timestamp, Option<f64>)>,
     guards: Guards,
     pub(crate) protected: BTreeMap<(BusIndex, CanId), ProtectionStats>,
     /// Voltage responses over short and long blocks.
@@ -150,6 +156,8 @@ impl WiringObserver {
         let answers: Vec<Answer> =
             by_question.keys().map(|question| Answer { question: *question, signals: Vec::new() }).collect();
         Self {
+            groups: ParameterGroups::new(plan.signals.iter().map(|signal| &signal.binding)),
+            direction: None,
             listener: Listener::new(&answers),
             by_question,
             buses: plan.interfaces.iter().map(bus).collect(),
@@ -182,6 +190,8 @@ impl WiringObserver {
 
     /// Handles a frame from any interface.
     pub fn handle_frame(&mut self, time: Timestamp, bus: BusIndex, frame: &Frame) {
+        let configured = self.groups.configured(bus, frame);
+        let frame = configured.as_ref().unwrap_or(frame);
         self.note_time(time);
         self.frames += 1;
         let Some(stats) = self.buses.get_mut(bus.index()) else { return };
@@ -245,7 +255,9 @@ impl WiringObserver {
 
     /// Reads signals of a frame's payload or of an answer's data.
     fn read_signals(&mut self, time: Timestamp, wanted: &[(SignalList, usize)], data: &[u8]) {
-        let Self { plan, series, more_cells, unconfigured, responses, other_currents, usage, witnesses, .. } = self;
+        let Self {
+            plan, series, more_cells, unconfigured, responses, other_currents, usage, witnesses, direction, ..
+        } = self;
         let cells = f64::from(plan.pack.cells.max(1));
         for &(list, index) in wanted {
             let (signals, series) = match list {
@@ -256,6 +268,14 @@ impl WiringObserver {
             let SignalPlan { binding, answer, .. } = &signals[index];
             let data = data.get(answer.map_or(0, |answer| answer.first_byte)..).unwrap_or_default();
             let is_configured = list == SignalList::Configured;
+            let signed = match direction.filter(|_| is_configured && binding.channel == Channel::Current) {
+                None => None,
+                Some((since, Some(sign))) if time.since(since) <= plan.max_age_s(Channel::Current) => {
+                    Some(Binding { scale: sign * binding.scale, offset: sign * binding.offset, ..binding.clone() })
+                }
+                Some(_) => continue,
+            };
+            let binding = signed.as_ref().unwrap_or(binding);
             let max_age_s = if is_configured { plan.max_age_s(binding.channel) } else { f64::INFINITY };
             let value = series[index].handle(time, data, binding, max_age_s);
             if let Some(value) = value.filter(|_| list != SignalList::MoreCells) {
@@ -279,6 +299,10 @@ impl WiringObserver {
                 | Channel::Balancing(_)
                 | Channel::PackIdentity
                 | Channel::Contactor => continue,
+                Channel::CurrentDirection => {
+                    *direction = Some((time, binding.value(data).ok()));
+                    continue;
+                }
             };
             let others = other_currents.values_mut().flat_map(OtherCurrent::responses_mut);
             responses.iter_mut().chain(others).for_each(|response| response.handle_voltage(time, cell, voltage_v));

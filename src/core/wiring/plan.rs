@@ -209,6 +209,7 @@ impl Kind {
             | Channel::SupplyVoltage
             | Channel::Balancing(_)
             | Channel::PackIdentity
+            | Channel::CurrentDirection
             | Channel::Contactor => Self::Reported,
         }
     }

@@ -118,6 +118,30 @@ impl MappedClock {
     }
 }
 
+/// Smallest change of the wall clock that counts as a step, ns. NTP daemons correct smaller errors gradually, by less
+/// than 1 ms a second.
+const MIN_STEP_NS: i64 = 100_000_000;
+
+/// Detects steps of the wall clock.
+#[derive(Debug, Clone, Copy)]
+pub struct StepDetector {
+    /// Wall time minus boot time at the latest reading, ns.
+    offset_ns: i64,
+}
+
+impl StepDetector {
+    /// A detector that compares the next reading with `reading`.
+    pub fn new(reading: Reading) -> Self {
+        Self { offset_ns: reading.offset_ns() }
+    }
+
+    /// The step of the wall clock since the last reading (s); `None` = no step. Call it at least once a minute.
+    pub fn step_s(&mut self, reading: Reading) -> Option<f64> {
+        let step_ns = reading.offset_ns() - std::mem::replace(&mut self.offset_ns, reading.offset_ns());
+        (step_ns.abs() >= MIN_STEP_NS).then_some(step_ns as f64 / 1e9)
+    }
+}
+
 /// Maps the stamps of one interface.
 #[derive(Debug, Clone)]
 pub struct StampMapper {
@@ -277,6 +301,17 @@ mod tests {
             now_ns.set(now_ns.get() + waits_ns.get(calls.replace(calls.get() + 1)).unwrap_or(&0) + 1000);
             now_ns.get() + if clock == ClockId::CLOCK_REALTIME { OFFSET } else { 0 }
         })
+    }
+
+    #[test]
+    fn step_is_detected_once_and_slew_is_not() {
+        let mut detector = StepDetector::new(at(0, 0));
+        assert_eq!(detector.step_s(at(S, 0)), None);
+        assert_eq!(detector.step_s(at(2 * S, -3600 * S)), Some(-3600.0));
+        assert_eq!(detector.step_s(at(3 * S, -3600 * S)), None);
+        for second in 0..1000 {
+            assert_eq!(detector.step_s(at((4 + second) * S, second * MS - 3600 * S)), None);
+        }
     }
 
     #[test]

@@ -5,12 +5,14 @@
 mod text;
 
 pub use text::command as command_words;
+pub use text::word;
 
 use std::io::{self, Write};
 
 use crate::alarm::{Change, Severity};
 use crate::can::flood::FloodChange;
 use crate::can::guard::GuardChange;
+use crate::can::j1939::NodeEvent;
 use crate::can::own_frames::OwnIdChange;
 use crate::can::poll::PollChange;
 use crate::can::rate::SenderChange;
@@ -98,7 +100,7 @@ impl EventLog {
                 log_learned(&event.kind);
             }
             EventKind::SignalBad { channel, fault } => {
-                tracing::warn!(channel = text::channel(channel), ?fault, "signal bad");
+                tracing::warn!(channel = text::channel(channel), fault = word(fault), "signal bad");
             }
             EventKind::SignalGood { channel, bad_readings } => {
                 tracing::info!(channel = text::channel(channel), bad_readings, "signal good");
@@ -145,8 +147,8 @@ impl EventLog {
             EventKind::Trust { cell, trusted: true, mean_nis } => {
                 tracing::info!(cell = number(cell), mean_nis = rounded(mean_nis), "estimate trusted again");
             }
-            EventKind::J1939 { what } => tracing::info!(?what, "J1939"),
-            EventKind::Mode { from, to } => tracing::info!(?from, ?to, "mode"),
+            EventKind::J1939 { what } => log_j1939(what),
+            EventKind::Mode { from, to } => tracing::info!(from = word(from), to = word(to), "mode"),
             EventKind::Command { source, command, changed, refused } => {
                 let source = match source {
                     Source::Local => "this computer",
@@ -163,7 +165,11 @@ impl EventLog {
                 );
             }
             EventKind::Test { rule, running } => {
-                tracing::info!(?rule, "{}", if running { "alarm test started" } else { "alarm test ended" });
+                tracing::info!(
+                    rule = rule.name(),
+                    "{}",
+                    if running { "alarm test started" } else { "alarm test ended" }
+                );
             }
             EventKind::PackReplaced { capacity_ah, capacity_std_ah } => {
                 let (capacity_ah, capacity_std_ah) = (capacity_ah.map(rounded), capacity_std_ah.map(rounded));
@@ -187,8 +193,8 @@ impl EventLog {
             EventKind::AlarmDropped { rule, severity, cell, active, occurrences } => {
                 let cell = cell.map(number);
                 tracing::warn!(
-                    ?rule,
-                    ?severity,
+                    rule = rule.name(),
+                    severity = severity.name(),
                     cell,
                     active,
                     occurrences,
@@ -251,6 +257,16 @@ fn number(cell: CellIndex) -> u32 {
     u32::from(cell.0) + 1
 }
 
+fn log_j1939(event: NodeEvent) {
+    match event {
+        NodeEvent::Claimed { address } => tracing::info!(address, "J1939 address claimed"),
+        NodeEvent::AddressLost { to } => tracing::warn!(name = %to, "J1939 address lost to another node"),
+        NodeEvent::AddressDefended { against } => tracing::info!(name = %against, "J1939 address defended"),
+        NodeEvent::CodesLeftOut { codes: 0 } => tracing::info!("J1939 message contains all trouble codes again"),
+        NodeEvent::CodesLeftOut { codes } => tracing::warn!(codes, "J1939 trouble codes do not fit into the message"),
+    }
+}
+
 fn log_poll(change: PollChange) {
     match change {
         PollChange::Silent { reason } => tracing::info!("diagnostic requests paused: {}", reason.words()),
@@ -274,8 +290,10 @@ fn log_model(kind: &EventKind) {
         ModelState::Unfit => {
             tracing::warn!(fits_better = chemistry, "the voltages contradict the chemistry on the label")
         }
-        _ if is_taken_back => tracing::warn!(?state, capacity_ah, "cell model reverted: the previous one was better"),
-        _ => tracing::info!(?state, capacity_ah, capacity_std_ah, residual_v, "cell model learned"),
+        _ if is_taken_back => {
+            tracing::warn!(state = word(state), capacity_ah, "cell model reverted: the previous one was better")
+        }
+        _ => tracing::info!(state = word(state), capacity_ah, capacity_std_ah, residual_v, "cell model learned"),
     }
 }
 
@@ -284,8 +302,8 @@ fn log_alarm(kind: &EventKind) {
     else {
         return;
     };
-    let (cell, value) = (cell.map(number), value.map(rounded));
-    let (probability, threshold) = (probability.map(rounded), rounded(threshold));
+    let (cell, value) = (cell.map(number), value.map(|value| rule.with_unit(value)));
+    let (probability, threshold) = (probability.map(rounded), rule.with_unit(threshold));
     let what = match change {
         Change::Raised => "alarm raised",
         Change::Suppressed => "alarm still raised, value unknown",
@@ -295,10 +313,11 @@ fn log_alarm(kind: &EventKind) {
         Change::Acknowledged => "alarm acknowledged",
         Change::Forgotten => "alarm forgotten",
     };
-    if change == Change::Raised && severity != Severity::Info {
-        tracing::warn!(?rule, cell, ?severity, value, probability, threshold, occurrences, "{what}");
+    let (rule, is_info, severity) = (rule.name(), severity == Severity::Info, severity.name());
+    if change == Change::Raised && !is_info {
+        tracing::warn!(rule, cell, severity, value, probability, threshold, occurrences, "{what}");
     } else {
-        tracing::info!(?rule, cell, ?severity, value, probability, threshold, occurrences, "{what}");
+        tracing::info!(rule, cell, severity, value, probability, threshold, occurrences, "{what}");
     }
 }
 
@@ -308,7 +327,15 @@ fn log_learned(kind: &EventKind) {
         EventKind::HalfCycle { cell, mode, charge_ah, swing, swing_std, duration_s, .. } => {
             let (charge_ah, duration_s) = (rounded(charge_ah), rounded(duration_s));
             let (swing, swing_std) = (known(swing), known(swing_std));
-            tracing::info!(cell = number(cell), ?mode, charge_ah, swing, swing_std, duration_s, "half-cycle");
+            tracing::info!(
+                cell = number(cell),
+                mode = word(mode),
+                charge_ah,
+                swing,
+                swing_std,
+                duration_s,
+                "half-cycle"
+            );
         }
         EventKind::Capacity { cell, measured_ah, values, .. } => {
             let mean = |quantity| known(values.mean(quantity));

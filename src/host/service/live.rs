@@ -16,7 +16,7 @@ use super::{INBOX, ServiceError, notify};
 use crate::cell::own_model::task::{FitFindings, FitTask};
 use crate::control::protocol::{Answer, CommandOutcome, Request};
 use crate::control::{PendingRequest, answer};
-use crate::io::clock::MappedClock;
+use crate::io::clock::{MappedClock, Reading, StepDetector};
 use crate::io::snapshot_file;
 use crate::io::stop::Stop;
 use crate::logging;
@@ -39,6 +39,7 @@ pub(super) struct ServiceLoop {
     pub(super) pending_answers: PendingAnswers,
     pub(super) reload: Reload,
     pub(super) clock: MappedClock,
+    pub(super) clock_steps: StepDetector,
     pub(super) batch: Vec<Record>,
     pub(super) left_out_reported: Instant,
     pub(super) status_publisher: StatusPublisher,
@@ -74,6 +75,7 @@ impl ServiceLoop {
                     // of these files.
                     if now.duration_since(flushed) >= Duration::from_secs(1) {
                         self.engine.flush();
+                        self.log_clock_step();
                         flushed = now;
                     }
                 }
@@ -92,6 +94,16 @@ impl ServiceLoop {
                     if received > 0 { self.handle_batch() }
                 }
             }
+        }
+    }
+
+    /// Logs a step of the wall clock.
+    fn log_clock_step(&mut self) {
+        if let Some(seconds) = self.clock_steps.step_s(Reading::now()) {
+            tracing::warn!(
+                seconds,
+                "wall clock stepped: times of estimates and events keep the old clock until a restart"
+            );
         }
     }
 

@@ -74,22 +74,49 @@ pub fn variables() -> String {
     ) + &classes()
 }
 
+/// Returns a declaration of a colour. The light value comes first, for viewers without CSS variables (librsvg).
+fn colour(property: &str, name: &str) -> String {
+    let light = COLOURS.iter().find(|colour| colour.0 == name).map_or("", |colour| colour.1);
+    format!("{property}:{light};{property}:var(--{name})")
+}
+
 fn classes() -> String {
-    let mut text = String::from(
-        "text{font-family:system-ui,-apple-system,'Segoe UI',Roboto,'DejaVu Sans',sans-serif;fill:var(--word)}\
-         .t{font-size:11.5px;fill:var(--soft)}.e{text-anchor:end}.m{text-anchor:middle}\
-         .q{font-size:14px;font-weight:600}.l{font-size:11.5px}\
-         .g{stroke:var(--rule);stroke-width:1;fill:none}.a{stroke:var(--grey);stroke-width:1;fill:none}\
-         .s{fill:none;stroke-width:1.4;stroke-linejoin:round}.d{stroke-dasharray:6 4}\
-         .o{stroke-width:4.5;stroke-linecap:round;fill:none}",
+    let mut text = format!(
+        "text{{font-family:system-ui,-apple-system,'Segoe UI',Roboto,'DejaVu Sans',sans-serif;{}}}\
+         .t{{font-size:11.5px;{}}}.e{{text-anchor:end}}.m{{text-anchor:middle}}\
+         .q{{font-size:14px;font-weight:600}}.l{{font-size:11.5px}}\
+         .g{{{};stroke-width:1;fill:none}}.a{{{};stroke-width:1;fill:none}}\
+         .s{{fill:none;stroke-width:1.4;stroke-linejoin:round}}.d{{stroke-dasharray:6 4}}\
+         .o{{stroke-width:4.5;stroke-linecap:round;fill:none}}.p{{{}}}",
+        colour("fill", "word"),
+        colour("fill", "soft"),
+        colour("stroke", "rule"),
+        colour("stroke", "grey"),
+        colour("fill", "page"),
     );
     for ink in Ink::ALL {
         let name = ink.name();
+        let (stroke, fill) = (colour("stroke", name), colour("fill", name));
         // Writing to a string cannot fail.
-        let _ = write!(
-            text,
-            ".k-{name}{{stroke:var(--{name})}}.f-{name}{{fill:var(--{name})}}.b-{name}{{fill:var(--{name});fill-opacity:.22}}"
-        );
+        let _ = write!(text, ".k-{name}{{{stroke}}}.f-{name}{{{fill}}}.b-{name}{{{fill};fill-opacity:.22}}");
     }
     text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_variable_follows_its_plain_colour() {
+        let style = variables();
+        let uses: Vec<&str> = style.split("var(--").collect();
+        assert!(uses.len() > 3 * Ink::ALL.len());
+        for (before, after) in uses.iter().zip(&uses[1..]) {
+            let name = after.split(')').next().unwrap();
+            let light = COLOURS.iter().find(|colour| colour.0 == name).unwrap().1;
+            let property = before.rsplit(['{', ';']).next().unwrap();
+            assert!(before.ends_with(&format!("{property}{light};{property}")), "{name}: {before}");
+        }
+    }
 }

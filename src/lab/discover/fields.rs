@@ -370,7 +370,7 @@ pub(super) fn database(fields: &[&MessageField]) -> Database {
         messages[place].signals.push(signal);
     }
     let comment = "Found by packwatch discover from values alone: positions and scales are guesses".to_owned();
-    Database { nodes: Vec::new(), comment: Some(comment), messages }
+    Database { comment: Some(comment), messages, ..Database::default() }
 }
 
 /// Creates a message without fields. If the field lies on a page, the message gets a multiplexor.
@@ -384,6 +384,7 @@ fn empty_message(field: &MessageField) -> Message {
         len_bytes: 8,
         sender: None,
         format: FrameFormat::Classic,
+        is_j1939: false,
         e2e: None,
         secoc: None,
         signals: field.page.map(|_| page).into_iter().collect(),

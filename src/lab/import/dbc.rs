@@ -9,32 +9,41 @@ use std::collections::BTreeMap;
 use std::fmt::Write as _;
 
 use crate::can::dbc::{Database, Message, Signal};
-use crate::can::unit::SignalUnit;
+use crate::can::unit::{Quantity, SignalUnit};
 use crate::discover::groups::groups;
 use crate::error::LabError;
 use crate::fit::quoted;
 use crate::wiring::evidence::{PackQuantity, SignalLabel};
 
-/// A candidate: points, and name of the signal.
-type Ranked = (f64, String);
+/// A candidate.
+#[derive(Debug, Clone)]
+struct Candidate {
+    points: f64,
+    /// Name of the signal, or pattern of several names.
+    name: String,
+    /// The lines that convert the signal's unit, such as `scale = 0.001`; empty if no conversion is needed.
+    conversion: Vec<String>,
+}
 
 /// Writes the `[input]` part.
 ///
 /// # Errors
 /// No signal looks like the current or a voltage of a battery.
 pub fn import(database: &Database, file: &str) -> Result<String, LabError> {
-    let mut candidates: BTreeMap<PackQuantity, Vec<Ranked>> = BTreeMap::new();
+    let mut candidates: BTreeMap<PackQuantity, Vec<Candidate>> = BTreeMap::new();
     for message in &database.messages {
         for signal in &message.signals {
             for (kind, points) in judge(message, signal) {
-                candidates.entry(kind).or_default().push((points, format!("{}.{}", message.name, signal.name)));
+                let name = format!("{}.{}", message.name, signal.name);
+                let candidate = Candidate { points, name, conversion: conversion(kind, signal) };
+                candidates.entry(kind).or_default().push(candidate);
             }
         }
     }
     let cells = candidates.remove(&PackQuantity::CellVoltage).unwrap_or_default();
     candidates.insert(PackQuantity::CellVoltage, with_patterns(cells));
     for ranked in candidates.values_mut() {
-        ranked.sort_by(|a, b| b.0.total_cmp(&a.0).then_with(|| a.1.cmp(&b.1)));
+        ranked.sort_by(|a, b| b.points.total_cmp(&a.points).then_with(|| a.name.cmp(&b.name)));
     }
     let is_empty = |kind| candidates.get(&kind).is_none_or(Vec::is_empty);
     if is_empty(PackQuantity::Current) && is_empty(PackQuantity::PackVoltage) && is_empty(PackQuantity::CellVoltage) {
@@ -67,6 +76,28 @@ fn judge(message: &Message, signal: &Signal) -> Vec<(PackQuantity, f64)> {
     PackQuantity::ALL.into_iter().filter_map(points).collect()
 }
 
+/// The keys that convert the unit of the DBC to the unit of the input. If a converted value would be smaller than any
+/// pack's, the unit in the DBC is wrong, and no key is returned.
+fn conversion(quantity: PackQuantity, signal: &Signal) -> Vec<String> {
+    let wanted = match quantity {
+        PackQuantity::Current => Quantity::Current,
+        PackQuantity::CellVoltage | PackQuantity::PackVoltage => Quantity::Voltage,
+        PackQuantity::Temperature => Quantity::Temperature,
+        // A fraction is below 1.5. The unit % needs no key.
+        PackQuantity::Soc | PackQuantity::Soh if signal.unit != "%" && largest(signal) > 1.5 => {
+            return vec!["scale = 0.01".to_owned()];
+        }
+        PackQuantity::Soc | PackQuantity::Soh => return Vec::new(),
+    };
+    let Some(unit) = SignalUnit::parse(&signal.unit).filter(|unit| unit.quantity == wanted) else { return Vec::new() };
+    let is_held = wanted == Quantity::Temperature || largest(signal) * unit.factor >= 1.0;
+    let key = |key: &str, value: f64, usual: f64| {
+        let rounded = (value * 1e9).round() / 1e9;
+        (is_held && value != usual).then(|| format!("{key} = {rounded:?}"))
+    };
+    key("scale", unit.factor, 1.0).into_iter().chain(key("offset", unit.offset, 0.0)).collect()
+}
+
 /// Returns the largest value that the bits can represent, or the maximum in the DBC if it is smaller.
 fn largest(signal: &Signal) -> f64 {
     let layout = &signal.layout;
@@ -75,15 +106,16 @@ fn largest(signal: &Signal) -> f64 {
 }
 
 /// If the names of at least three signals differ only in a number, joins these signals to one pattern and adds points.
-fn with_patterns(cells: Vec<Ranked>) -> Vec<Ranked> {
-    let names: Vec<(String, &str)> = cells.iter().map(|(_, name)| (String::new(), name.as_str())).collect();
+fn with_patterns(cells: Vec<Candidate>) -> Vec<Candidate> {
+    let names: Vec<(String, &str)> = cells.iter().map(|cell| (String::new(), cell.name.as_str())).collect();
     let found = groups(&names);
-    let mut ranked: Vec<Ranked> = Vec::new();
+    let mut ranked: Vec<Candidate> = Vec::new();
     let mut grouped = std::collections::BTreeSet::new();
     for group in found.iter().filter(|group| group.members.len() >= 3) {
         let first = group.members[0].1;
         // A group of many similar signals probably contains cells.
-        ranked.push((cells[first].0 + 4.0, group.pattern.clone()));
+        let Candidate { points, conversion, .. } = cells[first].clone();
+        ranked.push(Candidate { points: points + 4.0, name: group.pattern.clone(), conversion });
         grouped.extend(group.members.iter().map(|member| member.1));
     }
     let alone = cells.into_iter().enumerate().filter(|(index, _)| !grouped.contains(index));
@@ -91,7 +123,7 @@ fn with_patterns(cells: Vec<Ranked>) -> Vec<Ranked> {
     ranked
 }
 
-fn text(file: &str, candidates: &BTreeMap<PackQuantity, Vec<Ranked>>) -> String {
+fn text(file: &str, candidates: &BTreeMap<PackQuantity, Vec<Candidate>>) -> String {
     let name: String = file.chars().filter(|c| !c.is_control()).collect();
     let mut text = format!(
         "# Likely battery signals of {name}, judged only by name, unit and range, written by `packwatch import dbc`.\n\
@@ -101,7 +133,7 @@ fn text(file: &str, candidates: &BTreeMap<PackQuantity, Vec<Ranked>>) -> String 
     );
     let has_cells = candidates
         .get(&PackQuantity::CellVoltage)
-        .is_some_and(|found| found.iter().any(|(_, name)| name.contains("{n}")));
+        .is_some_and(|found| found.iter().any(|found| found.name.contains("{n}")));
     for (kind, ranked) in candidates {
         // Only one of cell voltage and pack voltage may be active.
         let is_active = match kind {
@@ -109,16 +141,20 @@ fn text(file: &str, candidates: &BTreeMap<PackQuantity, Vec<Ranked>>) -> String 
             PackQuantity::PackVoltage => !has_cells,
             _ => true,
         };
-        let Some((_, best)) = ranked.first() else { continue };
+        let Some(best) = ranked.first() else { continue };
         let mark = if is_active { "" } else { "# " };
-        let _ = write!(text, "\n{mark}{}\n{mark}signal = \"{best}\"\n", table(*kind));
+        let _ = write!(text, "\n{mark}{}\n{mark}signal = \"{}\"\n", table(*kind), best.name);
+        for key in &best.conversion {
+            let _ = writeln!(text, "{mark}{key}");
+        }
         if *kind == PackQuantity::Current {
             text.push_str(
                 "positive = \"?\"                  # charge or discharge: what does a positive value mean?\n",
             );
         }
-        for (_, other) in ranked.iter().skip(1).take(4) {
-            let _ = writeln!(text, "# or: {other}");
+        for other in ranked.iter().skip(1).take(4) {
+            let keys = other.conversion.iter().map(|key| format!(", {key}"));
+            let _ = writeln!(text, "# or: {}{}", other.name, keys.collect::<String>());
         }
     }
     text
@@ -167,6 +203,26 @@ mod tests {
         }
         assert!(!text.contains("MotorCurrent"), "{text}");
         assert!(text.parse::<toml::Table>().is_ok(), "{text}");
+    }
+
+    #[test]
+    fn unit_of_signal_gives_scale_and_offset() {
+        let text = imported(
+            "BO_ 1 HV: 8 A\n SG_ BattCurrent : 0|32@1- (1,0) [0|0] \"mA\" A\n SG_ BattSoc : 32|8@1+ (1,0) [0|100] \"\" A\n\
+             BO_ 2 Cells: 8 A\n SG_ Cell1 : 0|16@1+ (1,0) [0|5000] \"mV\" A\n SG_ Cell2 : 16|16@1+ (1,0) [0|5000] \"mV\" A\n \
+             SG_ Cell3 : 32|16@1+ (1,0) [0|5000] \"mV\" A\n SG_ BattTemp : 48|8@1+ (1,0) [0|0] \"degF\" A\n\
+             BO_ 3 Wrong: 8 A\n SG_ BattCurrent2 : 0|16@1- (0.01,0) [0|0] \"mA\" A\n",
+        )
+        .unwrap();
+        for part in [
+            "signal = \"HV.BattCurrent\"\nscale = 0.001\npositive",
+            "signal = \"Cells.Cell{n}\"\nscale = 0.001\n",
+            "signal = \"Cells.BattTemp\"\nscale = 0.555555556\noffset = -17.777777778\n",
+            "signal = \"HV.BattSoc\"\nscale = 0.01\n",
+            "# or: Wrong.BattCurrent2\n",
+        ] {
+            assert!(text.contains(part), "{part}\n{text}");
+        }
     }
 
     #[test]

@@ -11,6 +11,8 @@ _Path: TypeAlias = str | PathLike[str]
 _Paths: TypeAlias = _Path | Sequence[_Path]
 _Numbers: TypeAlias = Any
 """Anything that NumPy reads as numbers: arrays, Arrow arrays, columns of a table, lists. Masked and missing reals become NaN."""
+_Times: TypeAlias = Any
+"""Seconds, or ``datetime64``, which becomes Unix time. Times must not run backwards."""
 
 __all__ = [
     "BDF_COLUMNS",
@@ -105,7 +107,7 @@ class Monitor:
         """Number of values, in all rows already processed, that no configured frame can carry."""
     def rows(
         self,
-        time_s: _Numbers,
+        time_s: _Times,
         current_a: _Numbers,
         voltage_v: _Numbers,
         temperature_c: _Numbers | None = None,
@@ -115,7 +117,7 @@ class Monitor:
         """Processes rows. Positive current is discharge, NaN is unknown. ``voltage_v`` has a column per cell, ``temperature_c`` per sensor."""
     def frames(
         self,
-        time_s: _Numbers,
+        time_s: _Times,
         can_id: _Numbers,
         data: _Numbers,
         *,

@@ -21,10 +21,14 @@ pub(super) const DELAY_TIME: &str = "GenMsgDelayTime";
 pub(super) const FRAME_FORMAT: &str = "VFrameFormat";
 pub(super) const FRAME_FORMATS: [&str; 16] = {
     let mut words = ["reserved"; 16];
-    (words[0], words[1]) = ("StandardCAN", "ExtendedCAN");
+    (words[0], words[1], words[J1939_FORMAT]) = ("StandardCAN", "ExtendedCAN", "J1939PG");
     (words[FIRST_FD_FORMAT], words[FIRST_FD_FORMAT + 1]) = ("StandardCAN_FD", "ExtendedCAN_FD");
     words
 };
+/// Index of the format of J1939 in [`FRAME_FORMATS`].
+pub(super) const J1939_FORMAT: usize = 3;
+/// Protocol of the whole bus.
+const PROTOCOL: &str = "ProtocolType";
 /// Index of the first FD format in [`FRAME_FORMATS`].
 pub(super) const FIRST_FD_FORMAT: usize = 14;
 pub(super) const BIT_RATE_SWITCH: &str = "CANFD_BRS";
@@ -69,6 +73,19 @@ pub(super) fn format(dbc: &Dbc, id: MessageId) -> FrameFormat {
         }
         _ => FrameFormat::Classic,
     }
+}
+
+/// Whether the message is a J1939 parameter group. If no message has a frame format, the protocol of the bus decides.
+pub(super) fn is_j1939(dbc: &Dbc, id: MessageId) -> bool {
+    let of_bus = || {
+        let value = dbc.attribute_values_database.iter().find(|value| value.name == PROTOCOL)?;
+        if let AttributeValue::String(word) = &value.value { Some(word.clone()) } else { None }
+    };
+    matches!(id, MessageId::Extended(_))
+        && match word(dbc, id, FRAME_FORMAT) {
+            Some(format) => format == FRAME_FORMATS[J1939_FORMAT],
+            None => of_bus().is_some_and(|protocol| protocol.eq_ignore_ascii_case("J1939")),
+        }
 }
 
 /// The protection, if both attributes are valid.

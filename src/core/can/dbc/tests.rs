@@ -1,4 +1,5 @@
-//! Tests that the parser reads complete DBC texts, and that it rejects faulty texts with a line number.
+//! Tests that the parser reads complete DBC texts, that it leaves out faulty messages with a line number, and that it
+//! rejects texts without a usable message.
 
 use super::*;
 
@@ -80,7 +81,7 @@ SG_MUL_VAL_ 1 Deep Inner 0-3, 7-9;
 #[test]
 fn errors_state_their_line() {
     let line_and_text = |body: &str| {
-        let error = parse(body).unwrap_err();
+        let error = parse(body).map_or_else(|error| error, |mut db| db.left_out.swap_remove(0));
         (error.line, error.to_string())
     };
     let (line, text) = line_and_text("BO_ 1 A: 8 X\n SG_ Broken : 0|8@1+ (1,0 [0|0] \"\" X\n");
@@ -95,7 +96,7 @@ fn errors_state_their_line() {
     assert_eq!((line, text.contains("no multiplexor")), (6, true));
     let (line, text) =
         line_and_text(&format!("BO_ 1 A: 8 X\n{}{}", signal.replace("m1 ", ""), signal.replace("m1 ", "")));
-    assert_eq!((line, text.contains("A.S is defined twice")), (7, true));
+    assert_eq!((line, text.contains("A is left out: signal S is defined twice")), (7, true));
     for (numbers, found) in [
         ("(1e999,0) [0|0]", "factor inf"),
         ("(1,-1e999) [0|0]", "offset -inf"),
@@ -103,13 +104,91 @@ fn errors_state_their_line() {
         ("(1,0) [0|1e999]", "maximum inf"),
     ] {
         let (line, text) = line_and_text(&format!("BO_ 1 A: 8 X\n SG_ S : 0|8@1+ {numbers} \"\" X\n"));
-        assert_eq!((line, text.contains(&format!("A.S: {found}, must be finite"))), (6, true), "{text}");
+        assert_eq!(
+            (line, text.contains(&format!("A is left out: signal S: {found}, must be finite"))),
+            (6, true),
+            "{text}"
+        );
+    }
+}
+
+/// A text with a good message before and after `middle`.
+fn between_good_messages(middle: &str) -> Database {
+    let good = |id: u32, name: &str| format!("BO_ {id} {name}: 8 X\n SG_ V : 0|8@1+ (1,0) [0|0] \"V\" X\n\n");
+    let text = format!("{}{middle}{}CM_ SG_ 2 V \"two\nlines\";\n", good(1, "First"), good(2, "Last"));
+    let db = parse(&text).unwrap();
+    assert!(db.signal("First.V").is_some(), "{middle}");
+    assert_eq!(db.signal("Last.V").unwrap().1.comment.as_deref(), Some("two\nlines"), "{middle}");
+    db
+}
+
+#[test]
+fn faulty_message_is_left_out_alone() {
+    let signal = " SG_ S : 0|8@1+ (1,0) [0|0] \"\" X\n";
+    let twice = format!("{signal}{signal}");
+    for (middle, line, part) in [
+        (format!("BO_ 316495015 Bad: 8 X\n{signal}"), 8, "message Bad is left out: identifier 316495015, must be"),
+        (format!("BO_ 3758096385 Bad: 8 X\n{signal}"), 8, "message Bad is left out: identifier 3758096385, must be"),
+        (format!("BO_ 99999999999999999999999 Bad: 8 X\n{signal}"), 8, "message Bad is left out: identifier 9999"),
+        (format!("BO_ 3 Bad: 8 X\n{signal} SG_ T : 0|8@1+ (1,0 [0|0] \"\" X\n"), 10, "message Bad is left out: found"),
+        (format!("BO_ 3 Bad 8 X\n{signal}"), 8, "message Bad is left out: found"),
+        (format!("BO_ 3 Bad: 8 X\n{twice}"), 10, "message Bad is left out: signal S is defined twice"),
+        (format!("BO_ 3 Last: 8 X\n{twice}"), 10, "message Last is left out: signal S is defined twice"),
+        ("VAL_ 1 V 0 \"open ;\n".to_owned(), 8, "statement VAL_ is left out: found"),
+    ] {
+        let left_out = between_good_messages(&middle).left_out;
+        assert_eq!((left_out.len(), left_out[0].line), (1, line), "{left_out:?}");
+        assert!(left_out[0].what.starts_with(part), "{left_out:?}");
     }
 }
 
 #[test]
+fn file_of_messages_without_usable_identifier_is_read_with_warnings() {
+    let db = parse("BO_ 316495015 Bad: 8 X\n SG_ S : 0|8@1+ (1,0) [0|0] \"\" X\n").unwrap();
+    assert_eq!((db.messages.len(), db.left_out.len(), db.left_out[0].line), (0, 1, 5));
+}
+
+#[test]
+fn second_message_of_one_name_is_left_out() {
+    let db = between_good_messages("BO_ 3 First: 8 X\n SG_ Other : 0|8@1+ (1,0) [0|0] \"\" X\n");
+    assert_eq!(db.message("First").unwrap().id, CanId::Standard(1));
+    assert_eq!((db.left_out.len(), db.left_out[0].line), (1, 8), "{:?}", db.left_out);
+}
+
+#[test]
+fn details_of_left_out_message_reach_no_other_message() {
+    // The low 16 bits of the identifier are those of the message First.
+    let bad = format!("BO_ {} Bad: 8 X\n SG_ V : 0|8@1+ (1,0) [0|0] \"\" X\n", 0x10001);
+    let db = between_good_messages(&format!("{bad}CM_ SG_ {} V \"wrong\";\n", 0x10001));
+    assert_eq!(db.signal("First.V").unwrap().1.comment, None);
+}
+
+#[test]
+fn pseudo_message_is_skipped_without_warning() {
+    for id in [0xC000_0000_u32, 0x4000_0000] {
+        let pseudo = format!("BO_ {id} VECTOR__INDEPENDENT_SIG_MSG: 0 X\n SG_ S : 0|8@1+ (1,0) [0|0] \"\" X\n");
+        let db = between_good_messages(&pseudo);
+        assert_eq!((db.messages.len(), db.left_out), (2, vec![]));
+    }
+}
+
+#[test]
+fn long_list_of_left_out_messages_is_counted() {
+    let db = between_good_messages(&"BO_ 4096 Bad: 8 X\n".repeat(MAX_LISTED + 5));
+    assert_eq!(db.left_out.len(), MAX_LISTED + 1);
+    assert_eq!(db.left_out[MAX_LISTED].what, "5 more messages or statements from here on are left out");
+}
+
+#[test]
+fn cut_file_keeps_messages_before_cut() {
+    let body = "BO_ 1 First: 8 X\n SG_ V : 0|8@1+ (1,0) [0|0] \"V\" X\nBO_ 2 Last: 8 X\n SG_ V : 0|8@1+ (1,0) [0|0";
+    let db = parse(body).unwrap();
+    assert_eq!((db.messages.len(), db.left_out.len(), db.left_out[0].line), (1, 1, 8), "{:?}", db.left_out);
+}
+
+#[test]
 fn multiplexor_loops_are_rejected() {
-    let error = parse(
+    let db = parse(
         r#"BO_ 1 M: 8 X
  SG_ A m0M : 0|8@1+ (1,0) [0|0] "" X
  SG_ B m0M : 8|8@1+ (1,0) [0|0] "" X
@@ -117,7 +196,7 @@ SG_MUL_VAL_ 1 A B 0-0;
 SG_MUL_VAL_ 1 B A 0-0;
 "#,
     );
-    assert!(error.unwrap_err().what.contains("in a loop"));
+    assert!(db.unwrap().left_out[0].what.contains("in a loop"));
 }
 
 #[test]
@@ -130,7 +209,7 @@ fn latin_1_bytes_are_decoded() {
 #[test]
 fn arbitrary_text_never_panics() {
     let mut text = format!("{HEAD}BO_ 1 A: 8 X\n SG_ T M : 0|8@1+ (1,0) [0|0] \"\" X\nSG_MUL_VAL_ 1 T T 0-0;\n");
-    assert!(Database::parse(&text).is_err(), "a multiplexor that selects itself");
+    assert_eq!(Database::parse(&text).unwrap().left_out.len(), 1, "a multiplexor that selects itself");
     while text.pop().is_some() {
         let _ = Database::parse(&text);
     }

@@ -8,8 +8,8 @@ use std::fmt::Write as _;
 
 use super::attributes::{
     BIT_RATE_SWITCH, CYCLE_TIME, DELAY_TIME, E2E_DATA_ID, E2E_PROFILE, E2E_PROFILES, FAST_CYCLE_TIME, FIRST_FD_FORMAT,
-    FRAME_FORMAT, FRAME_FORMATS, NO_YES, REPETITIONS, SECOC_DATA_ID, SECOC_PROFILE, SECOC_PROFILES, profile_index,
-    secoc_index,
+    FRAME_FORMAT, FRAME_FORMATS, J1939_FORMAT, NO_YES, REPETITIONS, SECOC_DATA_ID, SECOC_PROFILE, SECOC_PROFILES,
+    profile_index, secoc_index,
 };
 use super::{Database, FrameFormat, Message, MuxCondition, Signal};
 use crate::can::CanId;
@@ -76,7 +76,12 @@ impl Database {
     fn attributes(&self, text: &mut String) {
         let is_fd = |message: &Message| message.format != FrameFormat::Classic;
         let format = |m: &Message| {
-            let place = usize::from(matches!(m.id, CanId::Extended(_))) + if is_fd(m) { FIRST_FD_FORMAT } else { 0 };
+            let is_extended = usize::from(matches!(m.id, CanId::Extended(_)));
+            let place = match m.format {
+                FrameFormat::Classic if m.is_j1939 => J1939_FORMAT,
+                FrameFormat::Classic => is_extended,
+                FrameFormat::Fd { .. } => is_extended + FIRST_FD_FORMAT,
+            };
             (place > 0).then(|| place.to_string())
         };
         let rate = |m: &Message| match m.format {

@@ -3,7 +3,7 @@
 //! In: frames. Out: readings. The good codes of a [`Binding`] are the raw codes with a valid value. They form a range,
 //! which is computed in advance. If "not available" codes split the range, its longest part is used. The binding itself
 //! decodes all other codes. The binding also decodes signals without such a range: floats, signals of 64 bits or
-//! spanning nine bytes, and signals whose scale is 0 or not finite. If a selector has too many codes for a table, the
+//! spanning nine bytes, signals whose scale is 0 or not finite, and the direction of the current. If a selector has too many codes for a table, the
 //! first binding of each group decodes the selector.
 
 use std::hint::cold_path;
@@ -315,7 +315,7 @@ impl LinearSignal {
         let is_regular = scale.is_finite() && scale != 0.0 && shift.is_finite();
         let plan = &binding.plan;
         let limits = [plan.low, plan.high, binding.range.0, binding.range.1];
-        if !is_regular || !plan.is_simple() || limits.iter().any(|limit| limit.is_nan()) {
+        if !is_regular || !binding.charge.is_empty() || !plan.is_simple() || limits.iter().any(|limit| limit.is_nan()) {
             return never_good;
         }
         let sign = if plan.value_type() == ValueType::Signed { 1 << (63 - plan.down) } else { 0 };

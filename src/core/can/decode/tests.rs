@@ -213,6 +213,15 @@ fn not_available_codes_work_anywhere_in_range() {
 }
 
 #[test]
+fn direction_is_minus_one_for_values_of_charge() {
+    let binding = Binding { charge: vec![1.0, 3.0], ..bind("Pack.Temperature", Channel::CurrentDirection) };
+    let map = InputMap::new(vec![Binding { offset: 40.0, ..binding }]);
+    let value = |code| readings(&map, 0, &Frame::classic(PACK, &[0, 0, code, 0, 0, 0]).unwrap())[0].1;
+    assert_eq!([0, 1, 2, 3].map(value), [Ok(1.0), Ok(-1.0), Ok(1.0), Ok(-1.0)]);
+    assert_eq!((value(255), value(251)), (Err(Fault::NotAvailable), Err(Fault::OutOfRange)));
+}
+
+#[test]
 fn other_bus_other_id_kind_and_remote_frames_are_ignored() {
     let frame = Frame::classic(PACK, &[0; 6]).unwrap();
     assert_eq!(readings(&map(), 0, &frame).len(), 3);
@@ -274,7 +283,21 @@ fn any_bindings() -> impl Strategy<Value = Vec<Binding>> {
         let id = if id == 2 { CanId::Extended(1) } else { CanId::Standard(id as u16) };
         let mux = page.into_iter().map(test).collect();
         let channel = cell(0);
-        Binding { bus: BusIndex(bus), id, len_bytes: 8, plan, mux, channel, scale, offset, not_available, range }
+        let (of_any_source, charge) = (false, Vec::new());
+        Binding {
+            bus: BusIndex(bus),
+            id,
+            of_any_source,
+            len_bytes: 8,
+            plan,
+            mux,
+            channel,
+            scale,
+            offset,
+            not_available,
+            range,
+            charge,
+        }
     });
     prop::collection::vec(binding, 0..12).prop_map(|mut bindings| {
         bindings.iter_mut().zip(0..).for_each(|(binding, n)| binding.channel = cell(n));

@@ -21,6 +21,9 @@ use crate::can::uds::{Answer, AnswerSignal, Controller, Question};
 use crate::can::{CanId, Frame, MAX_DATA};
 use crate::quantity::BusIndex;
 
+/// Largest code that is tried as a direction of the current. Directions are bits or bytes.
+const MAX_DIRECTION_CODE: u64 = 0xFFFF;
+
 /// Encodes values as input frames.
 #[derive(Debug, Clone)]
 pub struct InputEncoder {
@@ -84,6 +87,10 @@ struct InputField {
     offset: f64,
     /// Code for "no value"; `None` = no such code exists.
     missing: Option<u64>,
+    /// The code of charging and the code of discharging, if the field gives the direction of the current.
+    direction: Option<[u64; 2]>,
+    /// Whether the field carries the magnitude of the current, and another field its direction.
+    is_magnitude: bool,
     /// Whether `missing` is a configured "not available" code. If so, the channel causes a frame even without a value.
     has_not_available: bool,
 }
@@ -104,7 +111,12 @@ impl InputField {
             binding.plan.encode_raw(&mut payload, *code).is_ok() && binding.value(&payload).is_err()
         };
         Self {
-            channel: binding.channel,
+            channel: match binding.channel {
+                Channel::CurrentDirection => Channel::Current,
+                other => other,
+            },
+            direction: direction_codes(binding),
+            is_magnitude: false,
             number: 0,
             plan: binding.plan,
             scale: binding.scale,
@@ -129,9 +141,25 @@ impl InputField {
     }
 
     fn code(&self, value: Option<f64>) -> Option<u64> {
+        if let Some([charge, discharge]) = self.direction {
+            return Some(if value.is_some_and(|current_a| current_a < 0.0) { charge } else { discharge });
+        }
+        let value = value.map(|value| if self.is_magnitude { value.abs() } else { value });
         let value = value.and_then(|value| self.plan.code_beyond_range((value - self.offset) / self.scale));
         value.or(self.missing)
     }
+}
+
+/// The code of charging and the code of discharging; `None` = the signal is not the direction of the current, or has no
+/// such codes.
+fn direction_codes(binding: &Binding) -> Option<[u64; 2]> {
+    let code = |direction: f64| {
+        (0..=binding.plan.all_ones().min(MAX_DIRECTION_CODE)).find(|code| {
+            let mut payload = [0; MAX_DATA];
+            binding.plan.encode_raw(&mut payload, *code).is_ok() && binding.value(&payload) == Ok(direction)
+        })
+    };
+    if binding.charge.is_empty() { None } else { Some([code(-1.0)?, code(1.0)?]) }
 }
 
 impl InputEncoder {
@@ -189,9 +217,16 @@ impl InputEncoder {
     }
 
     fn numbered(mut self) -> Self {
+        // The direction of a current is sent before its magnitude, even in another message.
+        self.pages.sort_by_key(|page| !page.fields.iter().any(|field| field.direction.is_some()));
         let of_pages = self.pages.iter_mut().flat_map(|page| &mut page.fields);
         let of_answers = self.answers.iter_mut().flat_map(|answer| &mut answer.fields).map(|(_, field)| field);
-        of_pages.chain(of_answers).enumerate().for_each(|(number, field)| field.number = number);
+        let mut fields: Vec<_> = of_pages.chain(of_answers).collect();
+        let has_direction = fields.iter().any(|field| field.direction.is_some());
+        for (number, field) in fields.iter_mut().enumerate() {
+            field.number = number;
+            field.is_magnitude = has_direction && field.channel == Channel::Current && field.direction.is_none();
+        }
         self.places = RefCell::default();
         self
     }

@@ -242,7 +242,7 @@ pub fn layout(base: LayoutBase<'_>, settings: &LayoutSettings) -> Result<Databas
     if !faults.is_empty() {
         return Err(faults);
     }
-    Ok(Database { nodes: database.nodes.clone(), comment: database.comment.clone(), messages })
+    Ok(Database { nodes: database.nodes.clone(), comment: database.comment.clone(), messages, left_out: Vec::new() })
 }
 
 /// Applies the settings to a message. If `movable` is true, its signals may be moved.

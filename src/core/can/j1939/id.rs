@@ -69,6 +69,18 @@ pub(super) fn filter(pgn: u32, destination: u8) -> (u32, u32) {
     (can_id(0, pgn, destination, 0).raw(), WITHOUT_PRIORITY & !0xFF)
 }
 
+/// Parameter group number of an extended identifier; `None` for a standard identifier.
+pub fn parameter_group(id: CanId) -> Option<u32> {
+    Header::of(id).map(|header| header.pgn)
+}
+
+/// Identifier and mask of one group from any source to any destination with any priority.
+pub(crate) fn any_source(pgn: u32) -> (u32, u32) {
+    let (id, mask) = filter(pgn, 0);
+    let has_destination = pgn >> 8 & 0xFF < u32::from(FIRST_BROADCAST_FORMAT);
+    (id, if has_destination { mask & !0xFF00 } else { mask })
+}
+
 /// A PGN in a payload: three bytes, lowest first.
 pub(super) fn pgn_bytes(pgn: u32) -> [u8; 3] {
     let [low, middle, high, _] = pgn.to_le_bytes();

@@ -38,9 +38,10 @@ mod trouble_code;
 
 pub use codes::ActiveCode;
 pub use event::NodeEvent;
+pub(crate) use id::any_source;
 pub use id::{
     GLOBAL_ADDRESS, MAX_ADDRESS, NULL_ADDRESS, PGN_ACKNOWLEDGEMENT, PGN_ADDRESS_CLAIMED, PGN_DM1, PGN_DM2, PGN_REQUEST,
-    PGN_TRANSPORT_CONTROL, PGN_TRANSPORT_DATA,
+    PGN_TRANSPORT_CONTROL, PGN_TRANSPORT_DATA, parameter_group,
 };
 pub use name::{Name, NameFields, OutOfRange};
 pub use node::{Node, NodeConfig, NodeOutputs};

@@ -52,6 +52,7 @@ fn cells(identifier: u16, first: u16, count: u16) -> Answer {
         len_bytes: 8,
         sender: None,
         format: FrameFormat::Classic,
+        is_j1939: false,
         e2e: None,
         secoc: None,
         signals: vec![],

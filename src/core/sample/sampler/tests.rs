@@ -25,6 +25,7 @@ fn config() -> SampleConfig {
         temperature: limits(-40.0, 85.0, 30.0),
         reported_soc: None,
         reported_soh: None,
+        direction: None,
         contactor: None,
         sensor_of_cell: vec![Some(SensorIndex(0)), None],
         ambient_c: 20.0,
@@ -97,6 +98,27 @@ fn open_contactors_force_zero_current_and_charge() {
     bench.ok(15.0, Channel::Contactor, 1.0);
     let closed = bench.ok(16.0, CELL, 3.7).expect("a sample");
     assert_eq!((closed.current_a, closed.charge_as, closed.unmeasured_s), (Some(4.0), 6.0, 2.0));
+}
+
+#[test]
+fn magnitude_without_valid_direction_is_unknown_current() {
+    let direction = Some(limits(-1.0, 1.0, 2.0));
+    let mut bench = Bench::new(SampleConfig { direction, ..config() });
+    let current = |bench: &mut Bench, time: f64, magnitude_a: f64| {
+        bench.ok(time, Channel::Current, magnitude_a);
+        bench.ok(time, CELL, 3.7).expect("a sample").current_a
+    };
+    assert_eq!(current(&mut bench, 0.0, 2.0), None, "no direction yet");
+    bench.ok(1.0, Channel::CurrentDirection, -1.0);
+    assert_eq!(current(&mut bench, 1.0, 2.0), Some(-2.0));
+    bench.ok(2.0, Channel::CurrentDirection, 1.0);
+    assert_eq!(current(&mut bench, 3.0, 1.5), Some(1.5));
+    // The last good current stays fresh for its maximum age; a magnitude without direction does not replace it.
+    bench.give(4.0, Channel::CurrentDirection, Err(Fault::NotAvailable));
+    assert_eq!(current(&mut bench, 4.0, 9.0), Some(1.5));
+    bench.ok(5.0, Channel::CurrentDirection, 1.0);
+    assert_eq!(current(&mut bench, 7.0, 2.5), Some(2.5));
+    assert_eq!(current(&mut bench, 7.5, 8.0), Some(2.5), "the direction is too old");
 }
 
 #[test]

@@ -79,6 +79,7 @@ pub(super) fn channel(channel: Channel) -> String {
         Channel::Balancing(cell) => format!("balancing of cell {}", cell.0 + 1),
         Channel::SupplyVoltage => "supply voltage".to_owned(),
         Channel::PackIdentity => "pack identity".to_owned(),
+        Channel::CurrentDirection => "direction of the current".to_owned(),
         Channel::Contactor => "contactors".to_owned(),
     }
 }

@@ -121,6 +121,7 @@ fn definition(keys: &DiagnosticInput) -> Option<AnswerDefinition> {
         len_bytes: 8,
         sender: None,
         format: FrameFormat::Classic,
+        is_j1939: false,
         e2e: None,
         secoc: None,
         signals,

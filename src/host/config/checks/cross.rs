@@ -6,7 +6,7 @@ use crate::cell::{CapacityState, CellModel};
 use crate::config::document::TablePlace;
 use crate::config::schema::RawTables;
 use crate::config::schema::keys::{
-    CellVoltageInput, DiagnosticInput, MethodKey, Pack, PackVoltageInput, TemperatureInput,
+    CellVoltageInput, CurrentSign, DiagnosticInput, MethodKey, Pack, PackVoltageInput, TemperatureInput,
 };
 
 /// Maximum number of interfaces of one daemon. No vehicle computer has more, and the number fits a `BusIndex`.
@@ -21,6 +21,7 @@ pub(crate) fn check(raw: &RawTables, model: Option<&CellModel>) {
     vehicle(raw);
     interfaces(raw);
     sources(raw);
+    current_sign(raw);
     voltages(raw);
     balancing(raw, model);
     if let Some(pack) = &raw.pack {
@@ -44,6 +45,16 @@ fn vehicle(raw: &RawTables) {
         if text.chars().count() > MAX_VEHICLE_TEXT || text.contains(char::is_control) {
             keys.place.fault(key, format!("must be at most {MAX_VEHICLE_TEXT} characters without control characters"));
         }
+    }
+}
+
+/// Checks that the direction of the current is known: from the sign of the current, or from another signal.
+fn current_sign(raw: &RawTables) {
+    let Some(keys) = raw.current.as_ref().filter(|keys| keys.positive.is_none()) else { return };
+    if !raw.is_written::<CurrentSign>() && !raw.broken {
+        let what =
+            "input.current.positive is missing, must be charge or discharge: Meaning of a positive value on the bus";
+        raw.faults.add_at(&keys.place.at, what);
     }
 }
 

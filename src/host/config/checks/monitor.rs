@@ -131,6 +131,11 @@ fn sample(raw: &RawTables, pack: &Pack, model: &CellModel, found: &DbcRanges) ->
         temperature: raw.temperature_limits.as_ref()?.config(found.temperature_c),
         reported_soc: raw.reported_soc.as_ref().map(|keys| reported_limits(keys.max_age_s)),
         reported_soh: raw.reported_soh.as_ref().map(|keys| reported_limits(keys.max_age_s)),
+        direction: raw.current_sign.as_ref().map(|_| Limits {
+            min: -1.0,
+            max: 1.0,
+            ..reported_limits(raw.current_limits.as_ref().map_or(0.0, |keys| keys.max_age_s))
+        }),
         contactor: raw.contactor.as_ref().map(|keys| ContactorConfig {
             open: keys.open.clone(),
             limits: Limits { min: f64::NEG_INFINITY, max: f64::INFINITY, ..reported_limits(keys.max_age_s) },

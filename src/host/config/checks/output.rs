@@ -64,7 +64,9 @@ pub(crate) fn output(
     let laid_out: Vec<_> =
         frames.iter().copied().chain(command.map(|keys| (LayoutMessage::Command, keys.config()))).collect();
     let own = match &keys.dbc {
-        Some(name) => Some(read_dbc(&beside(config, name), read, &raw.faults)?),
+        Some(name) => {
+            Some(read_dbc(&beside(config, name), read, &raw.faults, |faults, at, what| faults.add_at(at, what))?)
+        }
         None => None,
     };
     // If the cell model is missing, this fault is already reported. Any capacity is then good enough to find further

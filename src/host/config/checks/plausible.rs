@@ -226,7 +226,7 @@ fn needed(channel: Channel) -> Option<(Quantity, &'static str)> {
         Channel::PackVoltage | Channel::CellVoltage(_) | Channel::SupplyVoltage => Some((Quantity::Voltage, "V")),
         Channel::Temperature(_) => Some((Quantity::Temperature, "degrees C")),
         Channel::ReportedSoc | Channel::ReportedSoh => Some((Quantity::PERCENTAGE, "% or a fraction")),
-        Channel::Balancing(_) | Channel::PackIdentity | Channel::Contactor => None,
+        Channel::Balancing(_) | Channel::PackIdentity | Channel::CurrentDirection | Channel::Contactor => None,
     }
 }
 

@@ -9,13 +9,14 @@ use std::path::Path;
 use super::answers::{self, AnswerDefinition, AnswerPlace};
 use super::pattern::Pattern;
 use crate::can::CanId;
-use crate::can::dbc::{Database, Message, Signal};
+use crate::can::dbc::{Database, DbcError, Message, Signal};
 use crate::can::decode::{Binding, InputMap};
+use crate::can::j1939::parameter_group;
 use crate::can::signal::{LayoutFault, ValueType};
-use crate::config::document::{Faults, ReadFile, TablePlace, beside, meant_file};
+use crate::config::document::{Faults, ReadFile, SourceLine, TablePlace, beside, meant_file};
 use crate::config::schema::RawTables;
 use crate::config::schema::did_you_mean;
-use crate::config::schema::keys::{DiagnosticInput, PositiveCurrent, SignalSource};
+use crate::config::schema::keys::{CurrentSign, DiagnosticInput, PositiveCurrent, SignalSource, SourceAddress};
 use crate::quantity::{BusIndex, CellIndex, Channel};
 
 /// Largest number of cell numbers listed in one fault.
@@ -78,6 +79,10 @@ pub(crate) struct ResolvedSignal<'d> {
     pub offset: f64,
     /// Raw codes that mean "not available", from the configuration and the DBC.
     pub not_available: Vec<u64>,
+    /// Values that mean charging, if the signal is the direction of the current; else empty.
+    pub charge: Vec<f64>,
+    /// Whether any J1939 source address may send the message.
+    pub of_any_source: bool,
 }
 
 /// Ranges and resolution stated by the DBC, in packwatch's units and sign. Ranges that are not stated are infinite.
@@ -106,7 +111,7 @@ impl Databases {
         let mut files = Vec::new();
         for (input, name) in raw.input.iter().flat_map(|input| input.dbc.iter().map(move |name| (input, name))) {
             let path = beside(config, name);
-            let database = read_dbc(&path, read, &raw.faults);
+            let database = read_dbc(&path, read, &raw.faults, |faults, at, what| faults.warn(at, what));
             if database.is_none() && raw.faults.is_unusable(&path.display().to_string()) {
                 let meant = meant_file(config, name);
                 let what = format!("{name:?} must be a DBC file, relative to the folder of the configuration{meant}");
@@ -147,15 +152,25 @@ impl Databases {
     }
 }
 
-/// Reads one DBC file; `None` = the file cannot be read (reported).
-pub(crate) fn read_dbc(path: &Path, read: ReadFile<'_>, faults: &Faults) -> Option<Database> {
+/// Reads one DBC file; `None` = the file cannot be read (reported). Parts of the file that are left out are reported by
+/// `report`.
+pub(crate) fn read_dbc(
+    path: &Path,
+    read: ReadFile<'_>,
+    faults: &Faults,
+    report: impl Fn(&Faults, &SourceLine, &str),
+) -> Option<Database> {
     let file = path.display().to_string();
     let bytes = read(path).map_err(|error| faults.add(&file, 0, format!("cannot be read: {error}"))).ok()?;
     let database = Database::parse_bytes(&bytes).map_err(|error| faults.add(&file, error.line, error.what)).ok()?;
+    let left_out =
+        database.left_out.iter().map(|DbcError { line, what }| (SourceLine { file: file.clone(), line: *line }, what));
     if database.messages.is_empty() {
+        left_out.for_each(|(at, what)| faults.add_at(&at, what));
         faults.add(&file, 0, "contains no message, must be a DBC file with at least one message (BO_)");
         return None;
     }
+    left_out.for_each(|(at, what)| report(faults, &at, what));
     Some(database)
 }
 
@@ -186,11 +201,11 @@ pub(crate) fn check_name(raw: &RawTables, databases: &Databases, source: &Signal
     }
 }
 
-/// Returns 1 or -1: the factor from the sign of the current on the bus to packwatch's sign.
+/// Returns 1 or -1: the factor from the sign of the current on the bus to packwatch's sign. A magnitude has no sign.
 fn current_sign(raw: &RawTables) -> f64 {
-    match raw.current.as_ref().map(|keys| keys.positive) {
-        Some(PositiveCurrent::Charge) => -1.0,
-        Some(PositiveCurrent::Discharge) | None => 1.0,
+    match raw.current.as_ref().and_then(|keys| keys.positive) {
+        Some(PositiveCurrent::Charge) if !raw.is_written::<CurrentSign>() => -1.0,
+        _ => 1.0,
     }
 }
 
@@ -219,6 +234,18 @@ impl<'d> Search<'_, 'd> {
         let names: Vec<String> = self.databases.signals().map(|signal| signal.full_name()).collect();
         let hint = did_you_mean(source.signal, names.iter().map(String::as_str));
         source.place.fault("signal", &(what + &hint));
+        self.left_out(source.signal);
+    }
+
+    /// Reports why the message of a signal was left out of its file.
+    fn left_out(&self, signal: &str) {
+        let Some((message, _)) = signal.split_once('.') else { return };
+        let beginning = format!("message {message} is left out: ");
+        for (name, database) in &self.databases.files {
+            let file = beside(Path::new(&self.raw.file), name).display().to_string();
+            let faults = database.left_out.iter().filter(|fault| fault.what.starts_with(&beginning));
+            faults.for_each(|fault| self.raw.faults.add(&file, fault.line, &fault.what));
+        }
     }
 
     /// Looks up the signals of all cells by a pattern. `first` is the number of the first cell in the signal names.
@@ -314,7 +341,35 @@ impl<'d> Search<'_, 'd> {
         let is_percent = signal.unit == "%" && matches!(channel, Channel::ReportedSoc | Channel::ReportedSoh);
         let usual_scale = if is_percent && !source.place.has("scale") { 0.01 } else { source.scale };
         let (scale, offset) = (sign * usual_scale, sign * source.offset);
-        self.found.push(ResolvedSignal { channel, bus, file, message, signal, answer, scale, offset, not_available });
+        let is_direction = channel == Channel::CurrentDirection;
+        let charge = self.raw.current_sign.as_ref().filter(|_| is_direction).map(|keys| keys.charge.clone());
+        let of_any_source = answer.is_none() && self.is_of_any_source(message);
+        self.found.push(ResolvedSignal {
+            channel,
+            bus,
+            file,
+            message,
+            signal,
+            answer,
+            scale,
+            offset,
+            not_available,
+            charge: charge.unwrap_or_default(),
+            of_any_source,
+        });
+    }
+
+    /// Whether any J1939 source address may send a message. If another message has the same parameter group, only the
+    /// source address distinguishes the two.
+    fn is_of_any_source(&self, message: &Message) -> bool {
+        let group = parameter_group(message.id);
+        let is_wanted = match self.raw.input.as_ref().map_or(SourceAddress::Auto, |input| input.source_address) {
+            SourceAddress::Auto => message.is_j1939,
+            SourceAddress::Any => group.is_some(),
+            SourceAddress::Exact => false,
+        };
+        let mut messages = self.databases.files.iter().flat_map(|(_, database)| &database.messages);
+        is_wanted && !messages.any(|other| other.id != message.id && parameter_group(other.id) == group)
     }
 }
 
@@ -330,6 +385,7 @@ pub(crate) fn channel_words(channel: Channel) -> String {
         Channel::Balancing(cell) => format!("cell {} balancing", cell.0 + 1),
         Channel::SupplyVoltage => "supply voltage".to_owned(),
         Channel::PackIdentity => "pack identity".to_owned(),
+        Channel::CurrentDirection => "direction of the current".to_owned(),
         Channel::Contactor => "contactors".to_owned(),
     }
 }
@@ -358,6 +414,8 @@ impl ResolvedSignal<'_> {
         binding.scale = self.scale;
         binding.offset = self.offset;
         binding.not_available.clone_from(&self.not_available);
+        binding.charge.clone_from(&self.charge);
+        binding.of_any_source = self.of_any_source;
         Ok(binding)
     }
 
@@ -396,6 +454,7 @@ pub(crate) fn ranges(found: &[ResolvedSignal<'_>], series: u16) -> DbcRanges {
         let widest = ranges.reduce(|a, b| (a.0.min(b.0), a.1.max(b.1))).unwrap_or(UNLIMITED);
         (widest.0 / divisor, widest.1 / divisor)
     };
+    let has_direction = found.iter().any(|resolved| resolved.channel == Channel::CurrentDirection);
     let voltage_v = if found.iter().any(|resolved| resolved.channel == Channel::PackVoltage) {
         widest(|channel| channel == Channel::PackVoltage, f64::from(series))
     } else {
@@ -406,7 +465,10 @@ pub(crate) fn ranges(found: &[ResolvedSignal<'_>], series: u16) -> DbcRanges {
     let per_cell = if found.iter().any(|it| it.channel == Channel::PackVoltage) { f64::from(series) } else { 1.0 };
     DbcRanges {
         voltage_step_v: steps.fold(0.0, f64::max) / per_cell,
-        current_a: widest(|channel| channel == Channel::Current, 1.0),
+        current_a: match widest(|channel| channel == Channel::Current, 1.0) {
+            (low, high) if has_direction => (-high.max(-low), high.max(-low)),
+            signed => signed,
+        },
         voltage_v,
         temperature_c: widest(|channel| matches!(channel, Channel::Temperature(_)), 1.0),
     }

@@ -60,7 +60,7 @@ impl Faults {
     }
 
     /// Adds a warning about a value that is allowed but unlikely. The configuration remains valid.
-    fn warn(&self, at: &SourceLine, text: impl fmt::Display) {
+    pub(crate) fn warn(&self, at: &SourceLine, text: impl fmt::Display) {
         note(&mut self.0.borrow_mut().warnings, at, text);
     }
 

@@ -12,10 +12,10 @@ mod pack;
 mod traffic;
 
 pub(crate) use algorithms::{Capacity, Estimator, Recharge, Transition, Usable};
-pub(crate) use choices::{E2eKey, MethodKey, PositiveCurrent, WireOrder};
+pub(crate) use choices::{E2eKey, MethodKey, PositiveCurrent, SourceAddress, WireOrder};
 pub(crate) use input::{
-    AnswerSignalKeys, BalancingInput, CellVoltageInput, ContactorInput, CurrentInput, DiagnosticInput, Input,
-    PackIdentityInput, PackVoltageInput, ProtectedInput, ReportedSocInput, ReportedSohInput, SignalSource,
+    AnswerSignalKeys, BalancingInput, CellVoltageInput, ContactorInput, CurrentInput, CurrentSign, DiagnosticInput,
+    Input, PackIdentityInput, PackVoltageInput, ProtectedInput, ReportedSocInput, ReportedSohInput, SignalSource,
     SupplyVoltageInput, TemperatureInput,
 };
 pub(crate) use limits::{CurrentLimits, TemperatureLimits, VoltageLimits};

@@ -2,7 +2,7 @@
 
 use super::keys::{
     Alarm, AnswerSignalKeys, Authentication, BalancingInput, Capacity, CellVoltageInput, Commands, ContactorInput,
-    CurrentInput, CurrentLimits, DiagnosticInput, Estimator, Input, Interface, J1939, Output, OutputAlarm,
+    CurrentInput, CurrentLimits, CurrentSign, DiagnosticInput, Estimator, Input, Interface, J1939, Output, OutputAlarm,
     OutputDigest, OutputFreshness, OutputHealth, OutputReply, OutputStatus, Pack, PackIdentityInput, PackModule,
     PackVoltageInput, Poll, ProtectedInput, Recharge, ReportedSocInput, ReportedSohInput, SignalSource, Store,
     SupplyVoltageInput, TemperatureInput, TemperatureLimits, Transition, Usable, Vehicle, VoltageLimits,
@@ -22,6 +22,7 @@ tables! {
         input: one Input,
         diagnostics: many DiagnosticInput with AnswerSignalKeys,
         current: one CurrentInput,
+        current_sign: optional CurrentSign,
         contactor: optional ContactorInput,
         cell_voltage: optional CellVoltageInput,
         balancing: optional BalancingInput,
@@ -144,6 +145,7 @@ impl RawTables {
             Channel::ReportedSoh => self.reported_soh.as_ref().map(|keys| keys.config()),
             Channel::SupplyVoltage => self.supply_voltage.as_ref().map(|keys| keys.config()),
             Channel::PackIdentity => self.pack_identity.as_ref().map(|keys| keys.config()),
+            Channel::CurrentDirection => self.current_sign.as_ref().map(|keys| keys.config()),
             Channel::Contactor => self.contactor.as_ref().map(|keys| keys.config()),
         }
     }
@@ -158,6 +160,7 @@ impl RawTables {
             Channel::ReportedSoh,
             Channel::SupplyVoltage,
             Channel::PackIdentity,
+            Channel::CurrentDirection,
             Channel::Contactor,
             Channel::CellVoltage(CellIndex(0)),
             Channel::Balancing(CellIndex(0)),

@@ -5,10 +5,19 @@ use crate::alarm::Selector;
 use crate::monitor::Command;
 use crate::quantity::Channel;
 
+/// Name of an enumeration value, as in JSON and on the command line.
+pub fn word(value: impl serde::Serialize) -> String {
+    match serde_json::to_value(value) {
+        Ok(serde_json::Value::String(word)) => word,
+        _ => "?".to_owned(),
+    }
+}
+
 /// The channel in words, such as `cell voltage 73`.
 pub(super) fn channel(channel: Channel) -> String {
     match channel {
         Channel::Contactor => "contactor".to_owned(),
+        Channel::CurrentDirection => "direction of the current".to_owned(),
         Channel::Current => "current".to_owned(),
         Channel::Temperature(sensor) => format!("temperature {}", u32::from(sensor.0) + 1),
         Channel::PackVoltage => "pack voltage".to_owned(),

@@ -141,7 +141,8 @@ prop_compose! {
         let secoc = secoc.map(|(profile, data_id)| Authentication { profile, data_id });
         let (id, name, signals) = (CanId::Standard(0), String::new(), assemble(parts));
         let repetition = Repetition { count, period_ms: times_ms[0], delay_ms: times_ms[1] };
-        (extended, Message { id, name, len_bytes, sender, format, e2e, secoc, signals, cycle_time_ms, repetition, comment })
+        let is_j1939 = extended && format == FrameFormat::Classic && count.is_some();
+        (extended, Message { id, name, len_bytes, sender, format, is_j1939, e2e, secoc, signals, cycle_time_ms, repetition, comment })
     }
 }
 
@@ -155,7 +156,7 @@ prop_compose! {
             let id = if extended { CanId::Extended(0x1FFF_FFFF - u32::from(number)) } else { CanId::Standard(number) };
             Message { id, name: format!("M{number}"), ..message }
         };
-        Database { nodes, comment, messages: (0..).zip(made).map(name).collect() }
+        Database { nodes, comment, messages: (0..).zip(made).map(name).collect(), left_out: Vec::new() }
     }
 }
 

@@ -25,6 +25,23 @@ fn near(found: Result<f64, Fault>, wanted: f64, within: f64) -> bool {
 }
 
 #[test]
+fn direction_and_magnitude_encode_signed_current() {
+    let direction = |name| Binding { charge: vec![1.0], ..bind(name, Channel::CurrentDirection) };
+    let magnitude = bind("Pack.Voltage", Channel::Current);
+    // The direction is in the message of the magnitude, or in a later message.
+    for direction in [Binding { offset: 40.0, ..direction("Pack.Temperature") }, direction("Nested.Always")] {
+        let map = InputMap::new(vec![direction, magnitude.clone()]);
+        for current_a in [12.3, -12.3, 0.0] {
+            let found = round_trip(&map, &[(Channel::Current, Some(current_a))]);
+            let [(Channel::CurrentDirection, Ok(sign)), (Channel::Current, Ok(magnitude_a))] = found[..] else {
+                unreachable!("{found:?}")
+            };
+            assert!((sign * magnitude_a - current_a).abs() < 1e-9, "{found:?}");
+        }
+    }
+}
+
+#[test]
 fn messages_and_pages_decode_to_encoded_values() {
     let values: Values = vec![
         (Channel::PackVoltage, Some(355.1)),

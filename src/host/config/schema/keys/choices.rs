@@ -23,6 +23,17 @@ pub(crate) enum PositiveCurrent {
     Discharge,
 }
 
+/// Which source addresses of J1939 carry a message of a DBC.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum SourceAddress {
+    /// Any address if the DBC says that the message is a J1939 parameter group, else the address in the DBC.
+    Auto,
+    /// Any address, for every extended identifier.
+    Any,
+    /// The address in the DBC.
+    Exact,
+}
+
 /// Which byte of a number comes first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum WireOrder {
@@ -46,6 +57,7 @@ pub(crate) enum MethodKey {
 pub(crate) struct E2eKey(pub Option<Profile>);
 
 choice!(PositiveCurrent { "charge" => Self::Charge, "discharge" => Self::Discharge });
+choice!(SourceAddress { "auto" => Self::Auto, "any" => Self::Any, "exact" => Self::Exact });
 choice!(WireOrder { "big" => Self::Big, "little" => Self::Little });
 choice!(MethodKey { "swing" => Self::Swing, "nominal" => Self::Nominal });
 choice!(E2eKey {

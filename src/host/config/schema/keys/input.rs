@@ -1,6 +1,6 @@
 //! Declares the tables that describe what is read from the buses: `[input]` and its subtables.
 
-use super::choices::{PositiveCurrent, WireOrder};
+use super::choices::{PositiveCurrent, SourceAddress, WireOrder};
 use crate::can::e2e::Profile;
 use crate::config::document::TablePlace;
 use crate::config::schema::key::Presence::{Default, Optional, Required};
@@ -14,6 +14,8 @@ section! {
     Input at "input" {
         /// DBC files that describe the signals named below, relative to this file. Not required if all signals are in the answers of `[[input.diagnostic]]`.
         dbc: Vec<String>, "", Any, Default("[]");
+        /// Which J1939 source addresses may send a message of the DBC files. "auto": any address, if the DBC gives the message the frame format J1939PG (attribute `VFrameFormat`) or, without this attribute, states `ProtocolType` J1939. "any": any address, for every 29-bit identifier. "exact": only the address in the DBC. Messages that share their parameter group (PGN) with another message of the DBC files are always matched exactly.
+        source_address: SourceAddress, "", Any, Default("\"auto\"");
         /// If all inputs are silent for this long and no current flows, the vehicle counts as asleep. Sleep is not a fault and raises no alarm; its beginning and its end are recorded as events (asleep, awake). Must be at least the largest `max_age_s` of current and voltages (`[limits.*]`). 0: the vehicle never counts as asleep, so the silent inputs of a parked vehicle are reported as missing.
         asleep_after_s: f64, "s", Between(0.0, 86_400.0), Default("5.0");
         /// Largest number of frames per second that are processed for one identifier on one interface. A tenth of this number may arrive at once. Further frames are dropped, counted and reported, so that a faulty sender cannot displace the others. The default is twice the rate of the fastest sensible sender (one frame per millisecond), and half of what fits on a 500 kbit/s bus.
@@ -144,7 +146,15 @@ signal_section! {
     /// The pack current.
     CurrentInput at "input.current", "A per unit of the DBC" {
         /// Meaning of a positive value on the bus. There is no default because buses differ. Everything that packwatch computes and reports uses positive = discharge.
-        positive: PositiveCurrent, "", Any, Required =>;
+        positive: Option<PositiveCurrent>, "", Any, Optional("required, unless `[input.current.sign]` gives the direction") =>;
+    }
+}
+
+signal_section! {
+    /// Where the direction of the current is, if `[input.current]` names a magnitude: a sign bit or a direction byte, in the same or in another message. It can be written in one line: `sign = { signal = "Pack.Charging", charge = [1] }`. While the direction is unknown (no valid value within `max_age_s` of `[limits.current]`), the current is unknown.
+    CurrentSign at "input.current.sign", "any unit" {
+        /// Signal values (after the DBC's factor, `scale` and `offset`) that mean charging. Every other value means discharging.
+        charge: Vec<f64>, "", NotEmpty, Required =>;
     }
 }
 
