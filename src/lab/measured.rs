@@ -120,7 +120,9 @@ mod tests {
             Err("cell.csv:3: column current_a: found \"x\", must be a finite number or an empty field".into())
         );
         let found = read("time_s,voltage_v\n0,3.5\n");
-        assert!(found.is_err_and(|error| error.starts_with("cell.csv:1: no column for current, found time_s,voltage_v;")));
+        assert!(
+            found.is_err_and(|error| error.starts_with("cell.csv:1: no column for current, found time_s,voltage_v;"))
+        );
         assert_eq!(read("time_s,current_a,voltage_v\n"), Err("cell.csv: no rows after the header".into()));
     }
 }

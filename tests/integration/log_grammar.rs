@@ -460,10 +460,10 @@ fn csv_columns_are_mapped_and_missing_one_named() {
     let path = file(folder.path(), "a.csv", b"t,I (A),U1,U2\n0,1,3,4\n");
     let error = read(std::slice::from_ref(&path), false, |_| {}).expect_err("one cell is configured");
     assert!(
-        error
-            .to_string()
-            .ends_with("2 columns of cell voltages, must be 1 as in the configuration, numbered from 0 or 1; found \
-                        t,I (A),U1,U2; name them with --column voltage=NAME"),
+        error.to_string().ends_with(
+            "2 columns of cell voltages, must be 1 as in the configuration, numbered from 0 or 1; found \
+                        t,I (A),U1,U2; name them with --column voltage=NAME"
+        ),
         "{error}"
     );
     let columns = [("time", "t"), ("current", "I (A)"), ("voltage{n}", "U{n}")].map(|(r, c)| (r.into(), c.into()));
