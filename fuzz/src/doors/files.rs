@@ -98,7 +98,7 @@ pub fn table(data: &[u8]) {
     ]);
     let content = [head, source.rest()].concat();
     with_file("a.csv", &content, |path| {
-        let _ = MeasuredFile::read(path);
+        let _ = MeasuredFile::read(path, &CsvOptions::default());
         let _ = History::read(path);
         let names = ["x".to_owned(), "y".to_owned()];
         let wanted = ColumnSelection { columns: &names[..1], optional: &names[1..], missing: MissingPolicy::Skipped };
