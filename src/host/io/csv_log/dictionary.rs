@@ -394,7 +394,10 @@ impl Format {
             Self::Basytec
         } else if word("prog time") || word("program duration") || word("ahaccu") {
             Self::Digatron
-        } else if word("step type") || word("record number") || (word("total time") && word("record")) {
+        } else if (word("step type") && !word("potential"))
+            || word("record number")
+            || (word("total time") && word("record"))
+        {
             Self::Neware
         } else if word("rec") || word("cyc") || word("dpt time") {
             Self::Maccor

@@ -4,6 +4,7 @@
 //! the user gives, else a name of the [dictionary](super::dictionary). A unit that does not fit the role is an error.
 
 use super::CsvOptions;
+use super::column_name::ColumnName;
 use super::dictionary::{Format, Known, Role, known};
 use crate::can::decode::{Channel, SensorIndex};
 use crate::io::table::{Header, PART_COLUMNS, TableError};
@@ -118,7 +119,7 @@ impl<'a> Columns<'a> {
 
     /// The unit that the name of a column states, even if the name itself is unknown.
     fn unit_of(&self, index: usize) -> Option<&'static Unit> {
-        let name = super::column_name::ColumnName::parse(&self.header.names()[index], self.header.unit_text(index));
+        let name = ColumnName::parse(&self.header.names()[index], self.header.unit_text(index));
         let of_role = self.known.iter().find(|(of, _)| *of == index).and_then(|(_, known)| known.unit);
         of_role
             .or(name.unit)
@@ -164,7 +165,7 @@ impl<'a> Columns<'a> {
         }
         let total = self.best(Role::Time);
         let is_step = |(index, _): &(usize, Known)| {
-            self.format == Format::Neware && known(&self.header.names()[*index], "").iter().any(|of| of.rank == 1)
+            self.format == Format::Neware && ColumnName::parse(&self.header.names()[*index], "").words == "time"
         };
         let found = total.filter(|of| !is_step(of)).or_else(|| self.best(Role::Date)).map(|of| (of, false));
         let found = found.or_else(|| self.best(Role::StepTime).or(total).map(|of| (of, true)));
