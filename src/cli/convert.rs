@@ -71,6 +71,9 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
             "the name does not state a format: must end in .log, .log.gz, .log.zst, .mf4 or .mcap, or give --to",
         )
     })?;
+    if format == Format::Mf4 && args.out == Path::new("-") {
+        return Err(Failure::new("-: MF4 cannot be written to standard output, give a file"));
+    }
     let config = args.config.as_deref().map(config::load).transpose()?;
     let has_estimates = format == Format::Mcap && config.is_some();
     if has_estimates && args.logs.iter().any(|log| log == Path::new("-")) {

@@ -202,7 +202,7 @@ impl Transposed {
         let (columns, rows) = (self.columns, self.rows);
         let count = out.len().min(self.bytes.len() - self.next);
         let whole = count / columns;
-        if self.next % columns == 0 && whole > 0 && self.next < columns * rows {
+        if self.next.is_multiple_of(columns) && whole > 0 && self.next < columns * rows {
             let first = self.next / columns;
             let whole = whole.min(rows - first);
             let out = &mut out[..whole * columns];

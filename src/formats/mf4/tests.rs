@@ -163,7 +163,7 @@ fn cut_unfinalized_file_keeps_frames_before_cut() {
         let log = read(&bytes[..len]);
         let frames = (5 * record + len - bytes.len()) / record;
         assert_eq!(log.frames(), whole[..frames], "cut after {len} bytes");
-        let is_between = (bytes.len() - len) % record == 0;
+        let is_between = (bytes.len() - len).is_multiple_of(record);
         assert_eq!(log.error.is_none(), is_between, "cut after {len} bytes: {:?}", log.error);
     }
 }

@@ -80,7 +80,7 @@ impl PcapNgReader {
         }
         let [kind, len] = [0, 4].map(|at| u32_at(head, at, self.big_endian));
         let len = len as usize;
-        if len < BLOCK_FRAME || len % 4 != 0 {
+        if len < BLOCK_FRAME || !len.is_multiple_of(4) {
             return Err(damaged(format!("block of {len} bytes, must be a multiple of 4 and at least {BLOCK_FRAME}")));
         }
         if is_section || len > WINDOW || !matches!(kind, INTERFACE | OLD_PACKET | SIMPLE_PACKET | PACKET) {
