@@ -339,12 +339,15 @@ fn state_direction(current: &mut Evidence, signals: &[LogSignal]) {
 fn compare_socs(socs: &mut [Evidence], signals: &[LogSignal]) {
     /// Largest difference between two states of charge that agree (%).
     const AGREEMENT: f64 = 3.0;
+    /// Below this value (%), signals agree by chance: unused signals are zero.
+    const EMPTY: f64 = 1.0;
     let means: Vec<f64> = socs.iter().map(|soc| signals[soc.members[0]].series.extent.mean()).collect();
-    let agreeing: Vec<usize> =
-        means.iter().map(|mean| means.iter().filter(|other| (*other - mean).abs() <= AGREEMENT).count() - 1).collect();
+    let agree = |mean: f64, other: f64| mean >= EMPTY && other >= EMPTY && (other - mean).abs() <= AGREEMENT;
+    let others = |mean: f64| means.iter().filter(|other| agree(mean, **other)).count().saturating_sub(1);
+    let agreeing: Vec<usize> = means.iter().map(|mean| others(*mean)).collect();
     let is_agreed = agreeing.iter().any(|count| *count > 0);
     for (soc, count) in socs.iter_mut().zip(agreeing) {
-        soc.add(1.0, count > 0, &format!("{count} other{} agree", if count == 1 { "" } else { "s" }));
+        soc.add(1.0, count > 0, &if count == 1 { "1 other agrees".to_owned() } else { format!("{count} others agree") });
         soc.add(-1.0, count == 0 && is_agreed, "the others agree on another value");
     }
 }
