@@ -25,6 +25,7 @@ const TABLE: &[(&str, &[&str], Core)] = &[
     ("sim", &["quantity", "can", "cell"], Core::Pure),
     ("wiring", &["quantity", "filter", "can", "sample", "cell", "monitor"], Core::Pure),
     ("ident", &["quantity", "filter", "regress", "cell"], Core::Pure),
+    ("formats", &["quantity", "can"], Core::Shell),
     ("config", CORE, Core::Shell),
     ("token_bucket", &["quantity"], Core::Shell),
     ("io", MODULES.split_at(13).0, Core::Shell),
@@ -77,8 +78,9 @@ const MODULES: [&str; 26] = [
 const CORE: &[&str] = MODULES.split_at(11).0;
 const BELOW_LAB: &[&str] = MODULES.split_at(25).0;
 /// Crates under `src`. `Some`: the table has one row for the whole crate.
-const CRATES: [(&str, Option<&str>); 6] = [
+const CRATES: [(&str, Option<&str>); 7] = [
     ("core", None),
+    ("formats", Some("formats")),
     ("host", None),
     ("lab", Some("lab")),
     ("python", Some("python")),
@@ -376,7 +378,7 @@ fn modules_import_only_what_map_allows() {
 #[test]
 fn table_lists_all_declared_modules() {
     let src = Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
-    let mut declared = ["regress", "ident", "lab", "uplink", "python", "main"].map(str::to_owned).to_vec();
+    let mut declared = ["formats", "regress", "ident", "lab", "uplink", "python", "main"].map(str::to_owned).to_vec();
     for lib in ["lib.rs", "core/lib.rs", "host/lib.rs"] {
         let source = std::fs::read_to_string(src.join(lib)).expect("a lib.rs");
         let names =

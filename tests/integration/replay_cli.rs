@@ -95,7 +95,8 @@ fn summary_is_json_on_request() {
 fn malformed_line_is_fatal_only_if_strict() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("a.log");
-    fs::write(&path, "(1.000000) vcan0 123#1\n").expect("written");
+    let good = "(2.000000) vcan0 100#801A06000000C409\n";
+    fs::write(&path, format!("(1.000000) vcan0 123#1\n{}", good.repeat(2))).expect("written");
     let path = path.display().to_string();
     let shown = replay(&[&path]).success().get_output().stdout.clone();
     assert!(String::from_utf8_lossy(&shown).contains("a.log:1: column 22: found \"1\""));
@@ -167,7 +168,9 @@ fn failed_log_is_named_and_others_continue() {
     let args = [&logs.each_ref().map(String::as_str)[..], &["--each"][..]].concat();
     let result = replay(&args).code(1);
     let error = String::from_utf8_lossy(&result.get_output().stderr).into_owned();
-    assert!(error.starts_with(&logs[1]) && error.lines().count() == 1, "{error}");
+    let failed = format!("{}: cannot be read", logs[1]);
+    assert!(error.lines().last().is_some_and(|line| line.starts_with(&failed)), "{error}");
+    assert_eq!(error.lines().count(), 3, "one line per table read, and the failed log: {error}");
     let reported = stdout_of(&result);
     let places = logs.each_ref().map(|log| reported.find(log.as_str()).expect("every log is reported"));
     assert!(places.is_sorted(), "{reported}");
@@ -208,7 +211,7 @@ fn each_rejects_unsuitable_options_by_name() {
 fn until_stops_reading_at_its_time() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("a.log");
-    let line = |n: u32| format!("({:010}.000000) vcan0 100#{n:016X}\n", 1_700_000_000 + n);
+    let line = |n: u32| format!("({:010}.000000) vcan0 100#801A06{:02X}0000C409\n", 1_700_000_000 + n, n % 7);
     fs::write(&path, (0..500).map(line).collect::<String>()).expect("written");
     let path = path.display().to_string();
     let output = stdout_of(&replay(&[&path, "--json", "--until", "+99"]).success());

@@ -23,6 +23,7 @@ pub fn try_changes(
     judge: &mut dyn FnMut(&mut Survey) -> Option<WiringReport>,
 ) {
     let errors = errors(report);
+    let faults = super::survey(config).map_or(0, |survey| survey.faults.len());
     let is_tried = |index: &usize| {
         let finding = &report.findings[*index];
         finding.severity != Severity::Note && !finding.changes.is_empty() && finding.changes.iter().all(is_exact)
@@ -34,7 +35,7 @@ pub fn try_changes(
         let Some(other) = judge(&mut survey) else { continue };
         let remains =
             other.findings.iter().any(|other| other.title == finding.title && other.severity == finding.severity);
-        let is_worse = self::errors(&other) > errors || !survey.faults.is_empty();
+        let is_worse = self::errors(&other) > errors || survey.faults.len() > faults;
         let finding = &mut report.findings[index];
         finding.is_solved = Some(!remains && !is_worse);
         if remains || is_worse {

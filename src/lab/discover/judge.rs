@@ -347,7 +347,11 @@ fn compare_socs(socs: &mut [Evidence], signals: &[LogSignal]) {
     let agreeing: Vec<usize> = means.iter().map(|mean| others(*mean)).collect();
     let is_agreed = agreeing.iter().any(|count| *count > 0);
     for (soc, count) in socs.iter_mut().zip(agreeing) {
-        soc.add(1.0, count > 0, &if count == 1 { "1 other agrees".to_owned() } else { format!("{count} others agree") });
+        soc.add(
+            1.0,
+            count > 0,
+            &if count == 1 { "1 other agrees".to_owned() } else { format!("{count} others agree") },
+        );
         soc.add(-1.0, count == 0 && is_agreed, "the others agree on another value");
     }
 }

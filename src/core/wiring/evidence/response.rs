@@ -281,6 +281,11 @@ impl VoltageResponse {
         if largest < 5.0 * self.tolerance_a { Slope::of(points(0.2 * largest)) } else { Slope::fit(&all) }
     }
 
+    /// Largest step of the median cell's voltage (V).
+    pub(crate) fn largest_voltage_step(&self) -> f64 {
+        self.voltage_steps_v[0]
+    }
+
     /// Third largest step of the median cell's voltage (V): one wrong reading makes two steps.
     pub(crate) fn large_voltage_step(&self) -> f64 {
         self.voltage_steps_v[2]

@@ -42,14 +42,16 @@ fn voltages(judge: &mut Judge<'_>) {
 /// Finds a current that never changes, or hardly changes, although the voltages step as under a load.
 fn pack_current(judge: &mut Judge<'_>, (signal, series): SignalSeries<'_>) {
     let noise_v = judge.median_of(Kind::Voltage, Series::noise).unwrap_or(0.0);
-    let step_v = judge.observed.fast_response().large_voltage_step() * judge.voltage_factor;
+    let is_still = series.extent.changes == 0;
+    let steps = judge.observed.fast_response();
+    let step_v =
+        if is_still { steps.largest_voltage_step() } else { steps.large_voltage_step() } * judge.voltage_factor;
     let is_step = step_v > (10.0 * noise_v / judge.cells_per_reading() * judge.voltage_factor).max(0.008);
     let swing_a = series.values.bulk().map_or(0.0, |(low, high)| high - low) * judge.current_factor;
     let model_ohm = judge.plan.pack.model.as_ref().map_or(0.0, |model| judge.model_ohm(model, 1.0).1);
     // Cold and age may raise the resistance, but not tenfold.
     let explained_v = 10.0 * swing_a * model_ohm / f64::from(judge.plan.pack.strings.max(1));
     let is_related = judge.observed.slope().is_some_and(|slope| slope.certainty() >= 1.0 && slope.r2 >= 0.2);
-    let is_still = series.extent.changes == 0;
     let is_dead = model_ohm > 0.0 && step_v > explained_v && !is_related;
     if series.count() < FEWEST_READINGS || !is_step || !(is_still || is_dead) {
         return;

@@ -42,9 +42,10 @@ pub(super) fn check_charge(judge: &mut Judge<'_>) {
         _ => None,
     };
     if let Some((side, is_rise)) = side {
-        let moved = |slope: ChargeSlope| if is_rise { slope.rise } else { slope.fall };
-        let is_by_soc = found.is_some_and(|(_, slope)| slope.r2 < 0.8 && moved(slope) >= LEAST_RANGE);
-        if is_by_soc || ocv::moves_against(judge, is_rise) {
+        // If the pack was only charged or only discharged, the sign may be inverted; `electrical` finds that.
+        let has_both = |slope: ChargeSlope| slope.rise.min(slope.fall) >= LEAST_RANGE;
+        let is_by_soc = found.is_some_and(|(_, slope)| slope.r2 < 0.8 && has_both(slope));
+        if is_by_soc || ocv::moves_against(judge, true) && ocv::moves_against(judge, false) {
             let verb = if is_rise { "rise" } else { "fall" };
             let what = if is_by_soc { "reported SOC and the voltages" } else { "voltages" };
             return one_sided(judge, current, side, &format!("{what} {verb}"));

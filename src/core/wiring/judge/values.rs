@@ -215,7 +215,9 @@ fn missing_offset(judge: &mut Judge<'_>, (signal, series): &SignalSeries<'_>) ->
     let on_bus =
         Series::of(series.values.kept().iter().zip(0_u32..).map(|(value, n)| (f64::from(n), Ok(sign * value))));
     let (low, high) = (on_bus.extent.min, on_bus.extent.max);
-    let Some(zero) = on_bus.zero_code(factor).filter(|zero| low > STEADY_A && *zero != 0.0) else { return false };
+    // A pack rests, or is charged and discharged, so that zero lies among the values. A factor explains other values.
+    let is_among = |zero: &f64| *zero != 0.0 && (low..=high).contains(&(zero * factor));
+    let Some(zero) = on_bus.zero_code(factor).filter(|zero| low > STEADY_A && is_among(zero)) else { return false };
     judge.is_mixed_up = true;
     let offset_a = signal.offset - zero * factor;
     error(judge, Topic::Unit, "the current never comes near zero: an offset is missing")

@@ -112,7 +112,7 @@ impl Databases {
         for (input, name) in raw.input.iter().flat_map(|input| input.dbc.iter().map(move |name| (input, name))) {
             let path = beside(config, name);
             let database = read_dbc(&path, read, &raw.faults, |faults, at, what| faults.warn(at, what));
-            if database.is_none() && raw.faults.is_unusable(&path.display().to_string()) {
+            if database.is_none() && read(&path).is_err() {
                 let meant = meant_file(config, name);
                 let what = format!("{name:?} must be a DBC file, relative to the folder of the configuration{meant}");
                 input.place.fault("dbc", what);

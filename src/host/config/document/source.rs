@@ -181,7 +181,8 @@ pub(crate) fn meant_file(config: &Path, named: &str) -> String {
     let own = paths(&folder);
     let below = own.iter().filter(|path| path.is_dir()).flat_map(|folder| paths(folder));
     let of_named = path.parent().map(paths).unwrap_or_default();
-    let name_of = |path: &Path| path.file_name().and_then(|name| name.to_str()).map(str::to_owned);
+    // The ending is equal in all names, so it must not count as likeness.
+    let name_of = |path: &Path| path.file_stem().and_then(|name| name.to_str()).map(str::to_owned);
     let is_alike = |other: &PathBuf| other.extension() == path.extension() && *other != path && other.is_file();
     let files = of_named.into_iter().chain(own.clone()).chain(below).filter(is_alike).take(MOST);
     let files: Vec<(String, PathBuf)> = files.filter_map(|file| Some((name_of(&file)?, file))).collect();

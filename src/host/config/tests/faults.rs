@@ -48,7 +48,6 @@ fn faults_state_file_line_key_found_and_allowed() {
             "\"a name too long to be one\"",
             "pack.toml:5: interface[1].name = \"a name too long to be one\", must be at most 15 characters without spaces or /",
         ),
-        ("dbc = [\"pack.dbc\"]", "dbc = [\"no.dbc\"]", "no.dbc: cannot be read: entity not found"),
         (
             "dbc = [\"pack.dbc\"]",
             "dbc = []",
@@ -210,4 +209,13 @@ fn faults_of_repeatable_tables_are_reported() {
         assert!(all.contains(&(*fault).to_owned()), "{text}: {all:#?}");
         assert!(all.len() == 1 || text.starts_with("[[interface]]"), "{text}: {all:#?}");
     }
+}
+
+#[test]
+fn missing_dbc_is_reported_at_its_key() {
+    let expected = [
+        "no.dbc: cannot be read: entity not found",
+        "pack.toml:7: input.dbc = [\"no.dbc\"], \"no.dbc\" must be a DBC file, relative to the folder of the configuration",
+    ];
+    assert_eq!(faults(&pack_with("dbc = [\"pack.dbc\"]", "dbc = [\"no.dbc\"]")), expected);
 }

@@ -64,6 +64,8 @@ impl TimeText {
             return count.checked_mul(nanos).map(Timestamp::from_nanos).filter(|time| is_representable(*time));
         }
         let seconds = self.unit.convert(text.parse().ok()?);
+        // Programs round minutes, hours and days to some digits, so the first sample after a minute is not at 60 s.
+        let seconds = if nanos > 1_000_000_000 { (seconds * 1e4).round() / 1e4 } else { seconds };
         let time = seconds.is_finite().then(|| Timestamp::from_secs(seconds));
         time.filter(|time| is_representable(*time))
     }
