@@ -14,7 +14,6 @@ mod driver;
 mod failure;
 mod in_order;
 mod intake;
-mod reading;
 mod rows;
 mod summary;
 
@@ -31,13 +30,13 @@ use crate::quantity::catalogue::RecordedValues;
 use crate::quantity::{BusIndex, CellIndex, Timestamp};
 use crate::sample::ReadingCounts;
 
+pub use crate::io::reading::{LogReading, RowFrames, SLEEP_GAP_S};
 pub use cells::CellSummary;
 pub use clock::LogTime;
 use clock::{Pace, RecordSpan, TimeWindow, WindowPosition};
 pub use driver::MonitorDriver;
 pub use in_order::in_order;
 pub use intake::ProtectedSummary;
-pub use reading::{LogReading, RowFrames, SLEEP_GAP_S};
 pub use rows::ESTIMATE_COLUMNS;
 use rows::{write_estimate, write_estimates_header, write_frame};
 pub use summary::ReplaySummary;

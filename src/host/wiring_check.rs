@@ -18,11 +18,11 @@ use crate::can::encode::{InputEncoder, InputProtector};
 use crate::io::clock::{MappedClock, Reading};
 use crate::io::csv_log::CsvOptions;
 use crate::io::log::{LogCounts, LogError, LogOptions, LogSource};
+use crate::io::reading::LogReading;
 use crate::io::socket::{PassiveSocket, explained};
 use crate::io::stop::Stop;
 use crate::monitor::{BusEvent, Monitor, Outputs, Record, RecordKind};
 use crate::quantity::BusIndex;
-use crate::replay::LogReading;
 use crate::wiring::{WiringObserver, WiringReport};
 
 pub use survey::{Survey, survey};

@@ -95,8 +95,8 @@ fn summary_is_json_on_request() {
 fn malformed_line_is_fatal_only_if_strict() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("a.log");
-    let good = "(2.000000) vcan0 100#801A06000000C409\n";
-    fs::write(&path, format!("(1.000000) vcan0 123#1\n{}", good.repeat(2))).expect("written");
+    let good = |second: u32| format!("({second}.000000) vcan0 100#801A06000000C409\n");
+    fs::write(&path, "(1.000000) vcan0 123#1\n".to_owned() + &good(2) + &good(3)).expect("written");
     let path = path.display().to_string();
     let shown = replay(&[&path]).success().get_output().stdout.clone();
     assert!(String::from_utf8_lossy(&shown).contains("a.log:1: column 22: found \"1\""));

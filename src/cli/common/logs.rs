@@ -4,7 +4,9 @@ use std::path::PathBuf;
 
 use super::numbers::positive;
 use crate::config::Config;
-use crate::io::csv_log::{CsvOptions, TableReading};
+#[cfg(feature = "lab")]
+use crate::io::csv_log::CsvOptions;
+use crate::io::csv_log::TableReading;
 use crate::io::log::LogOptions;
 use crate::replay::{LogReading, SLEEP_GAP_S};
 
@@ -85,6 +87,7 @@ pub(crate) fn charge_positive(sign: Option<CsvSign>) -> Option<bool> {
 }
 
 /// Columns and sign of the measured files of one cell.
+#[cfg(feature = "lab")]
 pub(crate) fn table_options(args: &InputArgs) -> CsvOptions {
     let charge_positive = charge_positive(args.csv_sign);
     CsvOptions { columns: args.columns.clone(), charge_positive, ..CsvOptions::default() }

@@ -14,6 +14,7 @@ pub mod log;
 pub mod paths;
 pub mod place;
 pub mod plausible;
+pub mod reading;
 pub mod record;
 pub mod result_file;
 mod row_limit;

@@ -5,9 +5,9 @@
 //! [`Outputs`], which the caller clears. Guarantee: `packwatch replay` with a log of the same inputs gives the same
 //! outputs.
 
-use super::reading::RowFrames;
 use crate::can::Frame;
 use crate::can::decode::Channel;
+use crate::io::reading::RowFrames;
 use crate::io::ticks::Ticks;
 use crate::monitor::{Monitor, MonitorConfig, Outputs, Record, TICK_PERIOD_MS};
 use crate::quantity::{BusIndex, Timestamp};

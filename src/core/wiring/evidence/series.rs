@@ -233,13 +233,20 @@ impl Series {
     }
 }
 
-/// Thins readings by time: keeps whole windows, so that the steps from reading to reading stay in the sample however
-/// long the log is, and all signals keep the same times.
+/// Thins readings. Fast readings are first thinned to a few per second. Then whole windows of time are kept, so that the
+/// steps from reading to reading stay in the sample however long the log is, and all signals keep the same times.
 fn windows(mut readings: Vec<(f64, f64)>) -> Vec<(f64, f64)> {
     // 4096 values suffice for a correlation, and samples of this size fit into memory for thousands of signals.
     const MOST: usize = 4096;
     // Longer than the period of most signals, and short enough that fast signals keep many windows.
     const WINDOW_S: f64 = 8.0;
+    // A load changes within some tenths of a second.
+    const FINE_S: f64 = 0.5;
+    let span_s = readings.first().zip(readings.last()).map_or(0.0, |((first_s, _), (last_s, _))| last_s - first_s);
+    let period_s = span_s / readings.len().max(1) as f64;
+    let finest = if period_s > 0.0 { (FINE_S / period_s) as usize } else { 1 };
+    let stride = readings.len().div_ceil(MOST).min(finest).max(1);
+    readings = readings.into_iter().step_by(stride).collect();
     let mut mask = 0_u64;
     while readings.len() > MOST && mask < u64::MAX >> 1 {
         mask = mask << 1 | 1;

@@ -56,6 +56,11 @@ pub(super) fn check(judge: &mut Judge<'_>) {
     }
 }
 
+/// Whether steps show that the configured sign of the current is wrong.
+pub(super) fn is_inverted(judge: &Judge<'_>) -> bool {
+    cell_slope(judge).is_some_and(|slope| slope.certainty() >= 1.0 && slope.r2 >= 0.2 && slope.ohm < 0.0)
+}
+
 /// The pack's slope in ohm per cell, corrected for the unit factors found and for parallel strings.
 fn cell_slope(judge: &Judge<'_>) -> Option<Slope> {
     let slope = judge.observed.slope()?;

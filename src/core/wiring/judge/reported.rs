@@ -3,6 +3,7 @@
 //! wrong current contradicts them.
 
 use super::context::{Judge, error};
+use super::electrical;
 use super::ocv::{self, OcvEstimate};
 use super::text::{number, percent, toml};
 use crate::cell::{CellModel, Chemistry, Label};
@@ -41,8 +42,8 @@ pub(super) fn check_charge(judge: &mut Judge<'_>) {
         (false, true) => Some(("positive", false)),
         _ => None,
     };
-    if let Some((side, is_rise)) = side {
-        // If the pack was only charged or only discharged, the sign may be inverted; `electrical` finds that.
+    if let Some((side, is_rise)) = side.filter(|_| !electrical::is_inverted(judge)) {
+        // If the pack was only charged or only discharged, the sign may be inverted instead.
         let has_both = |slope: ChargeSlope| slope.rise.min(slope.fall) >= LEAST_RANGE;
         let is_by_soc = found.is_some_and(|(_, slope)| slope.r2 < 0.8 && has_both(slope));
         if is_by_soc || ocv::moves_against(judge, true) && ocv::moves_against(judge, false) {
