@@ -164,7 +164,7 @@ type Mistake = (&'static str, &'static [(&'static str, &'static str)], &'static 
 const OF_CELLS: &[Mistake] = &[
     ("1", &[("\"charge\"", "\"discharge\"")], &["sign of the current is inverted", "+ positive = \"charge\""]),
     ("2, fewer", &[("cells = 4", "cells = 3")], &["the pack has 4 cells, 3 are configured"]),
-    ("2, more", &[("cells = 4", "cells = 5")], &["cells 5"]),
+    ("2, more", &[("cells = 4", "cells = 5")], &["each of 5 cells", "none has number 5"]),
     ("5", &[("BmsStatus.Current", "BmsStatus.PackVoltage")], &["pack current is read from a voltage"]),
     ("6", &[("BmsStatus.Current", "BmsSummary.Cycles")], &["pack current: the value never changes"]),
     (
@@ -201,7 +201,7 @@ const OF_TOTAL: &[Mistake] = &[
     ("3", &[("cells = 96", "cells = 49")], &["49 cells cannot have this pack voltage"]),
     ("4, fewer", &[("cells = 96", "cells = 86")], &["number of cells", "contradicts the reported SOC"]),
     ("4, more", &[("cells = 96", "cells = 108")], &["number of cells", "contradicts the reported SOC"]),
-    ("14", &[("nmc-graphite", "lfp-graphite")], &["chemistry", "+ chemistry = \"nmc-graphite\""]),
+    ("14", &[("nmc-graphite", "lfp-graphite")], &["100 to 145 cells", "or pack.chemistry is wrong", "nmc-graphite"]),
 ];
 
 /// Tries the mistakes of a pack. Returns those that are not named.

@@ -5,6 +5,7 @@ use super::electrical;
 use super::text::{channels, number, percent, toml};
 use super::unit::unit_of;
 use crate::can::signal::{ByteOrder, ValueType};
+use crate::cell::Chemistry;
 use crate::quantity::Channel;
 use crate::wiring::evidence::layout::{AlternativeReading, LAYOUT_FAULTS};
 use crate::wiring::evidence::{Extent, STEADY_A, Series};
@@ -164,11 +165,26 @@ fn pack_count(judge: &mut Judge<'_>, total_v: f64) {
     let pack = &plan.pack;
     let (min_v, max_v) = pack.model.as_ref().map_or((2.8, 4.2), |m| (m.voltage_min_v, m.voltage_max_v));
     let (fewest, most) = ((total_v / max_v).ceil(), (total_v / min_v).floor());
-    let (total, per_cell) = (number(total_v), number(total_v / f64::from(pack.cells.max(1))));
-    error(judge, Topic::CellCount, format!("{} cells cannot have this pack voltage", pack.cells))
+    let cell_v = total_v / f64::from(pack.cells.max(1));
+    let (total, per_cell) = (number(total_v), number(cell_v));
+    let other = pack.label.map(|label| other_chemistries(label.chemistry, cell_v)).filter(|names| !names.is_empty());
+    let finding = error(judge, Topic::CellCount, format!("{} cells cannot have this pack voltage", pack.cells))
         .seen(format!("{total} V in total: {per_cell} V per cell"))
         .why(format!("cells of this model have {min_v} to {max_v} V: {fewest} to {most} cells are possible"))
         .change("pack", "cells", format!("{fewest} to {most}, the number in the pack's documentation"));
+    if let Some(names) = other {
+        finding.advice(format!("or pack.chemistry is wrong: {per_cell} V per cell fits {names}"));
+    }
+}
+
+/// Names of the other chemistries whose cells can have this voltage.
+fn other_chemistries(configured: Chemistry, cell_v: f64) -> String {
+    let fits = |chemistry: Chemistry| {
+        let (low, high) = chemistry.usual_voltages_v();
+        chemistry != configured && (low..=high).contains(&cell_v)
+    };
+    let names = Chemistry::ALL.into_iter().filter(|(chemistry, _)| fits(*chemistry)).map(|(_, name)| name);
+    names.collect::<Vec<_>>().join(", ")
 }
 
 fn current(judge: &mut Judge<'_>) {
