@@ -174,6 +174,9 @@ fn user_names_unit_of_column() {
     assert!(wrong.is_err_and(|error| error.contains("b is in mV, so it cannot be the current")));
 }
 
+/// Writes a sample as a row of a table.
+type Row<'a> = &'a dyn Fn(&Sample) -> String;
+
 #[test]
 fn cells_of_applications_are_read_by_number() {
     let (bench, rows) = (Bench::new(2), drive());
@@ -188,7 +191,7 @@ fn cells_of_applications_are_read_by_number() {
     let in_mv = |s: &Sample| format!("{},{},{},{}", s.second, volt(s.current_ma), s.voltage_mv, s.voltage_mv - 7);
     let in_v =
         |s: &Sample| format!("{},{},{},{}", s.second, volt(s.current_ma), volt(s.voltage_mv), volt(s.voltage_mv - 7));
-    let row: [(&str, &str, &dyn Fn(&Sample) -> String); 6] = [
+    let row: [(&str, &str, Row<'_>); 6] = [
         ("LeafSpy", "epoch time,Pack Amps,CP1,CP2", &in_mv),
         ("cells in mV by size", "Time (s),Current (A),V1,V2", &in_mv),
         ("V1", "Time (s),Current (A),V1,V2", &in_v),

@@ -160,7 +160,7 @@ impl CsvLog {
             discharged: layout.discharged,
             sections,
             kind: table.header().find("type"),
-            is_bdf: layout.format == dictionary::Format::BatteryDataFormat,
+            is_bdf: layout.format == dictionary::Format::Bdf,
             reading,
             table,
             discharged_ah: f64::NAN,

@@ -297,7 +297,7 @@ fn cell_counts(judge: &Judge<'_>, points: &[(OcvEstimate, f64)], model: &CellMod
     // A number that is off by more than a factor of two gives an impossible voltage, which another check reports.
     let mut fitting = (configured / 2 + 1..configured.saturating_mul(2)).filter(fits);
     let first = fitting.next()?;
-    Some((first, fitting.last().unwrap_or(first)))
+    Some((first, fitting.next_back().unwrap_or(first)))
 }
 
 /// The first other chemistry that agrees with the reported state of charge.

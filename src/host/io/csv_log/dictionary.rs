@@ -357,7 +357,7 @@ pub(super) fn score(fields: &[String]) -> usize {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Format {
     Packwatch,
-    BatteryDataFormat,
+    Bdf,
     Arbin,
     Neware,
     Maccor,
@@ -385,7 +385,7 @@ impl Format {
             || begins("test_time_milli")
             || begins("unix time / ")
         {
-            Self::BatteryDataFormat
+            Self::Bdf
         } else if word("ecell") || word("ewe") || begins("ox/red") {
             Self::BioLogic
         } else if word("cp") && word("pack amps") {
@@ -421,7 +421,7 @@ impl Format {
     pub(super) const fn name(self) -> Option<&'static str> {
         Some(match self {
             Self::Packwatch | Self::Unknown => return None,
-            Self::BatteryDataFormat => "Battery Data Format",
+            Self::Bdf => "Battery Data Format",
             Self::Arbin => "Arbin",
             Self::Neware => "Neware",
             Self::Maccor => "Maccor",
@@ -440,13 +440,9 @@ impl Format {
             Self::Packwatch | Self::PyBamm => Some(false),
             // The Battery Data Format does not state the sign, but its net capacity is charged minus discharged
             // capacity, and cyclers use this sign.
-            Self::BatteryDataFormat
-            | Self::Arbin
-            | Self::Neware
-            | Self::BioLogic
-            | Self::Digatron
-            | Self::Basytec
-            | Self::Cellpy => Some(true),
+            Self::Bdf | Self::Arbin | Self::Neware | Self::BioLogic | Self::Digatron | Self::Basytec | Self::Cellpy => {
+                Some(true)
+            }
             Self::Maccor | Self::LeafSpy | Self::Unknown => None,
         }
     }
