@@ -131,13 +131,15 @@ def test_at_most_one_estimate_per_period(record):
     np.testing.assert_array_equal(thin["soc"], every["soc"][::60])
 
 
-def test_clock_step_back_restarts_periods(record):
+def test_time_running_backwards_is_refused(record):
     time_s = np.concatenate([record.time_s[:3000] + 5000.0, record.time_s[:3000]])
     columns = [np.concatenate([column[:3000]] * 2) for column in (record.current_a, record.voltage_v, record.temperature_c)]
-    every = pw.Monitor(PAPER).rows(time_s, *columns).estimates
-    thin = pw.Monitor(PAPER, estimates_period_s=60.0).rows(time_s, *columns).estimates
-    earlier, kept = (np.count_nonzero(table["time_s"] < 4000.0) for table in (every, thin))
-    assert earlier > 2000 and abs(kept - earlier / 60) < 2
+    monitor = pw.Monitor(PAPER)
+    with pytest.raises(pw.DataError, match=r"time_s\[3000\] = 0, must not be before time_s\[2999\] = 7999"):
+        monitor.rows(time_s, *columns)
+    monitor.rows(time_s[:3000], *[column[:3000] for column in columns])
+    with pytest.raises(pw.DataError, match="must not be before the latest time of the call before = 7999"):
+        monitor.rows(time_s[3000:], *[column[3000:] for column in columns])
 
 
 def test_tables_are_zero_copy_arrow(record):

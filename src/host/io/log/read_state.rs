@@ -152,7 +152,7 @@ impl ReadState {
                 Ok(ParsedLine { line: Line::Other, .. }) if self.strict && !journal && !is_remark(bytes) => {
                     Err(LineError { column: 1, expected: "a candump line, a comment (#) or a blank line" })
                 }
-                Ok(ParsedLine { line: Line::Other, .. }) => {
+                Ok(ParsedLine { line: Line::Other, .. }) if !journal => {
                     self.note_ignored(name, number, bytes);
                     Ok(None)
                 }
@@ -203,7 +203,10 @@ impl ReadState {
                 self.counts.xl_frames += 1;
                 None
             }
-            Line::Other => None,
+            Line::Other => {
+                self.counts.ignored_lines += 1;
+                None
+            }
         }
     }
 
