@@ -131,7 +131,13 @@ pub(crate) fn search(logs: &[PathBuf], known: &Known, channels: Vec<(String, Str
     let discovery = discoverer.finish(&interfaces);
     if discovery.frames == 0 {
         let names: Vec<_> = logs.iter().map(|log| log.display().to_string()).collect();
-        return Err(Failure::new(format!("{}: no CAN frames; give a journal or a CAN log", names.join(", "))));
+        let names = names.join(", ");
+        return Err(Failure::new(match counts.tables.is_empty() {
+            true => format!("{names}: no CAN frames; give a journal or a CAN log"),
+            false => format!(
+                "{names}: a table has no CAN frames; `packwatch report -c PACK.toml` and `packwatch score` read tables"
+            ),
+        }));
     }
     Ok(Search { discoverer, discovery, counts, interfaces })
 }
