@@ -68,7 +68,7 @@ def test_caller_overrides_sign_of_file(record, tmp_path):
 
 
 def test_missing_column_is_named(record, tmp_path):
-    with pytest.raises(pw.DataError, match="no column for voltage, found Test Time / s,Current / A"):
+    with pytest.raises(pw.DataError, match="no column Voltage / V, found Test Time / s,Current / A"):
         pw.from_bdf(as_bdf(record)[["Test Time / s", "Current / A"]])
     (tmp_path / "x.bdf").write_text("Test Time / s,Voltage / V\n0,3.9\n")
     with pytest.raises(pw.DataError, match=r"x.bdf:1: no column for current, found Test Time / s,Voltage / V"):
