@@ -32,7 +32,6 @@ pub(crate) struct BlfReader {
     objects: ByteStream<Containers>,
     start_ns: i64,
     channels: ChannelList,
-    has_ended: bool,
     /// Whether the next object must be searched for, because the bytes before it are damaged.
     is_lost: bool,
 }
@@ -56,7 +55,7 @@ impl BlfReader {
         let start_ns = unix_ms(date).map_or(0, |ms| ms.saturating_mul(1_000_000));
         file.skip(size as u64)?;
         let objects = ByteStream::new(Containers::new(file));
-        Ok(Self { objects, start_ns, channels: ChannelList::default(), has_ended: false, is_lost: false })
+        Ok(Self { objects, start_ns, channels: ChannelList::default(), is_lost: false })
     }
 
     /// Reads the next object; `None` at the end.
@@ -111,9 +110,6 @@ impl BlfReader {
 
 impl LogReader for BlfReader {
     fn next_item(&mut self) -> io::Result<Option<Item>> {
-        if self.has_ended {
-            return Ok(None);
-        }
         match self.next_object() {
             // A container is damaged: the object that continues in it is lost, the next container may be good.
             Err(error) if error.kind() == io::ErrorKind::InvalidData => {
@@ -121,10 +117,7 @@ impl LogReader for BlfReader {
                 self.is_lost = true;
                 Ok(Some(Item::Bad(error.to_string())))
             }
-            result => {
-                self.has_ended = !matches!(result, Ok(Some(_)));
-                result
-            }
+            result => result,
         }
     }
 

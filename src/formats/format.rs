@@ -6,7 +6,7 @@ use std::io::{self, Read};
 use crate::blf::{self, BlfReader};
 use crate::mf4::{self, Mf4Reader};
 use crate::pcap::{self, PcapNgReader, PcapReader};
-use crate::{LogReader, text};
+use crate::{Channel, Item, LogReader, Position, text};
 
 /// A log format of another tool.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -86,15 +86,16 @@ impl Format {
     /// # Errors
     /// Fails if the source cannot be read or its header is damaged.
     pub fn open(self, source: Source) -> io::Result<Box<dyn LogReader>> {
-        match self {
+        let reader: Box<dyn LogReader> = match self {
             // Binary formats.
-            Self::Blf => Ok(Box::new(BlfReader::open(source)?)),
-            Self::Mf4 => Ok(Box::new(Mf4Reader::open(source)?)),
-            Self::Pcap => Ok(Box::new(PcapReader::open(source)?)),
-            Self::PcapNg => Ok(Box::new(PcapNgReader::open(source))),
+            Self::Blf => Box::new(BlfReader::open(source)?),
+            Self::Mf4 => Box::new(Mf4Reader::open(source)?),
+            Self::Pcap => Box::new(PcapReader::open(source)?),
+            Self::PcapNg => Box::new(PcapNgReader::open(source)),
             // Text formats.
-            text => text::open(text, source.reader),
-        }
+            text => text::open(text, source.reader)?,
+        };
+        Ok(Box::new(UntilEnd { reader, has_ended: false }))
     }
 
     /// Name of the format, for messages: "Vector ASC".
@@ -131,5 +132,30 @@ fn binary(head: &[u8]) -> Option<Format> {
         Some(Format::Pcap)
     } else {
         begins(&[pcap::SECTION_HEADER]).then_some(Format::PcapNg)
+    }
+}
+
+/// A reader that returns nothing after the end or an error, whatever the format's reader would return.
+struct UntilEnd {
+    reader: Box<dyn LogReader>,
+    has_ended: bool,
+}
+
+impl LogReader for UntilEnd {
+    fn next_item(&mut self) -> io::Result<Option<Item>> {
+        if self.has_ended {
+            return Ok(None);
+        }
+        let result = self.reader.next_item();
+        self.has_ended = !matches!(result, Ok(Some(_)));
+        result
+    }
+
+    fn position(&self) -> Position {
+        self.reader.position()
+    }
+
+    fn channels(&self) -> &[Channel] {
+        self.reader.channels()
     }
 }

@@ -48,7 +48,6 @@ pub(crate) struct PcapReader {
     form: Form,
     link: Option<LinkType>,
     channels: ChannelList,
-    has_ended: bool,
     /// Offset of the packet read last.
     at: u64,
 }
@@ -72,7 +71,7 @@ impl PcapReader {
             return Err(damaged(packet::other_link_type(number)));
         }
         packets.consume(FILE_HEAD);
-        Ok(Self { packets, form, link, channels: ChannelList::default(), has_ended: false, at: 0 })
+        Ok(Self { packets, form, link, channels: ChannelList::default(), at: 0 })
     }
 
     fn next_packet(&mut self) -> io::Result<Option<Item>> {
@@ -104,12 +103,7 @@ impl PcapReader {
 
 impl LogReader for PcapReader {
     fn next_item(&mut self) -> io::Result<Option<Item>> {
-        if self.has_ended {
-            return Ok(None);
-        }
-        let result = self.next_packet();
-        self.has_ended = !matches!(result, Ok(Some(_)));
-        result
+        self.next_packet()
     }
 
     fn position(&self) -> Position {

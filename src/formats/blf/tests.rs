@@ -1,3 +1,5 @@
+//! Tests the reader of BLF files on files that are built in memory, whole, cut and damaged.
+
 use packwatch_core::can::{CanId, Frame};
 use packwatch_core::quantity::Timestamp;
 

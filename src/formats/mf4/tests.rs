@@ -1,3 +1,5 @@
+//! Tests the reader and the writer of MF4 files on files that are built in memory, whole, cut and damaged.
+
 use std::io::Cursor;
 
 use packwatch_core::can::{CanId, Frame};

@@ -43,7 +43,6 @@ pub(crate) struct PcapNgReader {
     big_endian: bool,
     interfaces: Vec<Interface>,
     channels: ChannelList,
-    has_ended: bool,
     /// Offset of the block read last.
     at: u64,
 }
@@ -55,7 +54,6 @@ impl PcapNgReader {
             big_endian: false,
             interfaces: Vec::new(),
             channels: ChannelList::default(),
-            has_ended: false,
             at: 0,
         }
     }
@@ -127,12 +125,7 @@ impl PcapNgReader {
 
 impl LogReader for PcapNgReader {
     fn next_item(&mut self) -> io::Result<Option<Item>> {
-        if self.has_ended {
-            return Ok(None);
-        }
-        let result = self.next_block();
-        self.has_ended = !matches!(result, Ok(Some(_)));
-        result
+        self.next_block()
     }
 
     fn position(&self) -> Position {

@@ -1,3 +1,5 @@
+//! Tests the readers of PCAP and PCAPNG files on files that are built in memory, whole, cut and damaged.
+
 use packwatch_core::quantity::Timestamp;
 
 use crate::testing::{assert_cuts_keep_frames, assert_damage_is_survived, fd_frame, frame, read};

@@ -1,3 +1,5 @@
+//! Tests the reader of tables on small texts.
+
 use super::*;
 use crate::quantity::CellIndex;
 

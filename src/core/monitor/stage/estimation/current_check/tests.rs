@@ -1,3 +1,5 @@
+//! Tests the check of the current sensor on simulated loads with known faults.
+
 use super::*;
 use crate::quantity::CellIndex;
 
