@@ -147,9 +147,20 @@ fn write_frames(args: &Args, config: Option<&Config>, output: &mut Output) -> Re
     if let Some(first) = &counts.first_bad_line {
         eprintln!("{} of {} lines cannot be read, first {first}", counts.bad_lines, counts.lines);
     }
+    if source.has_moved_stamps() {
+        eprintln!("a log begins before the end of the log before it, so its stamps were moved to follow that log");
+    }
     summary.interfaces = source.interfaces().join(", ");
-    if summary.frames + summary.error_frames > 0 {
+    let good = summary.frames + summary.error_frames;
+    if good > counts.bad_lines {
         return Ok(summary);
+    }
+    if good > 0 {
+        let bad = counts.bad_lines;
+        return Err(named(
+            &args.out,
+            format!("not written, because {bad} lines are bad and only {good} frames are good"),
+        ));
     }
     let first = counts.first_ignored_line.as_ref().map_or_else(String::new, |line| format!(", first line {line}"));
     let names: Vec<_> = args.logs.iter().map(|log| log.display().to_string()).collect();

@@ -80,6 +80,13 @@ pub(crate) enum Positive {
     Discharge,
 }
 
+impl Known {
+    /// Whether the user describes the battery, and not only its frames.
+    pub(crate) fn has_answers(&self) -> bool {
+        self.label.is_some() || self.model.is_some() || self.positive.is_some()
+    }
+}
+
 /// Result of a search, and what made it.
 pub(crate) struct Search {
     discoverer: Discoverer,

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use packwatch_host::failure::Failure;
 
 use super::common::logs::{InputArgs, channel};
-use super::common::output::{failure, print, word};
+use super::common::output::{failure, named, print, word};
 use super::discover::{self, Known, Search};
 use super::{doctor, report};
 use crate::io::result_file::check_place;
@@ -38,7 +38,8 @@ pub(crate) struct Args {
     /// Read a channel or interface of a log as this interface, as for `replay`
     #[arg(long = "channel", value_name = "CHANNEL=INTERFACE", value_parser = channel)]
     channels: Vec<(String, String)>,
-    /// Keep the configuration in this file. If the file exists, it is used and not changed
+    /// Keep the configuration in this file, and the fields that no DBC describes in PACK.dbc. If the file exists, it is used
+    /// and not changed
     #[arg(long, value_name = "PACK.toml")]
     write: Option<PathBuf>,
     /// HTML report to write
@@ -49,6 +50,9 @@ pub(crate) struct Args {
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     check_place(&args.out, discover::inputs(&args.files, &args.known).chain(&args.write)).map_err(Failure::new)?;
+    if let Some(file) = args.files.iter().find(|file| *file == Path::new("-") || file.exists() && !file.is_file()) {
+        return Err(named(file, "must be a file, because `look` reads its logs several times"));
+    }
     let search = discover::search(&args.files, &args.known, args.channels.clone())?;
     print(&section("log", logs(args, &search)))?;
     print(&section("signals", signals(&search)))?;
@@ -115,11 +119,17 @@ fn signals(search: &Search) -> Vec<String> {
 fn configure(args: &Args, search: &Search, file: &Path) -> Result<Vec<String>, Failure> {
     let name = file.display();
     if args.write.is_some() && file.exists() {
-        return Ok(vec![format!("{name} exists, so it is used as it is")]);
+        let ignored = if args.known.has_answers() { "; --label, --model and --positive are not used" } else { "" };
+        return Ok(vec![format!("{name} exists, so it is used as it is{ignored}")]);
     }
     let pack: PackConfiguration = search
         .configuration(&args.files[0], &args.known, file)?
         .map_err(|questions| Failure::new(format!("please answer, so that the battery can be judged:\n{questions}")))?;
+    let own = file.with_extension("dbc");
+    if pack.database.is_some() && own.exists() {
+        let advice = "exists and would be replaced; give it with --dbc, or give --write another name";
+        return Err(named(&own, advice));
+    }
     let own = discover::save(&pack, file, discover::inputs(&args.files, &args.known))?;
     let mut lines = match &args.write {
         Some(_) => own.iter().chain([&file.to_owned()]).map(|file| format!("{} written", file.display())).collect(),

@@ -91,6 +91,16 @@ fn drive_in_other_formats_gives_same_estimates() {
 }
 
 #[test]
+fn candump_log_with_comment_is_no_table() {
+    let folder = tempfile::tempdir().unwrap();
+    let log = folder.path().join("shell.log");
+    let drive = fs::read_to_string(example("drive.log")).unwrap();
+    fs::write(&log, format!("# candump -L vcan0,100:7FF\n{drive}")).unwrap();
+    let expected = estimates(folder.path(), example("drive.log").to_str().unwrap());
+    assert!(estimates(folder.path(), log.to_str().unwrap()) == expected);
+}
+
+#[test]
 fn doctor_and_discover_read_other_formats() {
     let folder = tempfile::tempdir().unwrap();
     let log = write(folder.path(), "a.asc", "base hex timestamps absolute\n", |us, id, bytes| {
@@ -154,6 +164,14 @@ fn look_writes_report_or_asks() {
         assert!(text.contains(part), "{part} is not in: {text}");
     }
     assert!(fs::read_to_string(&out).unwrap().contains("</html>"));
+    let text = stderr(&packwatch(&["look", "-", "--label", "nmc:2.6Ah"]).code(1));
+    assert!(text.contains("-: must be a file"), "{text}");
+    // Without a DBC, the fields are written to pack.dbc, which must not replace another file.
+    let (car, own) = (path("car.toml"), path("car.dbc"));
+    fs::write(&own, "MINE").unwrap();
+    let text = stderr(&packwatch(&["look", log, "--label", "nmc:2.6Ah:4s", "--out", &out, "--write", &car]).code(1));
+    assert!(text.contains("car.dbc: exists and would be replaced"), "{text}");
+    assert_eq!(fs::read_to_string(&own).unwrap(), "MINE");
     // An edited configuration is used and kept.
     let edited = fs::read_to_string(&pack).unwrap().replace("rated_capacity_ah = 2.6", "rated_capacity_ah = 2.5");
     fs::write(&pack, &edited).unwrap();

@@ -8,7 +8,7 @@
 mod message_table;
 mod parameter_groups;
 
-pub use parameter_groups::ParameterGroups;
+pub use parameter_groups::{GroupFrame, GroupSenders, ParameterGroups};
 
 use message_table::MessageTable;
 

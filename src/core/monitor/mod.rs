@@ -33,6 +33,7 @@ use stages::Stages;
 
 use crate::alarm::CommandOutcome;
 use crate::can::Frame;
+use crate::can::decode::GroupFrame;
 use crate::can::encode::ReplyFields;
 use crate::can::poll::Poller;
 use crate::can::secoc::MacCheck;
@@ -152,8 +153,12 @@ impl Monitor {
     /// Handles a frame: passes its readings to the stages, or executes its command.
     fn handle_frame(&mut self, received: ReceivedFrame<'_>, out: &mut Outputs) {
         let Self { config, clock, intake, stages, .. } = self;
-        let configured = config.input.groups().configured(received.bus, received.frame);
-        let received = ReceivedFrame { frame: configured.as_ref().unwrap_or(received.frame), ..received };
+        let found = config.input.groups().configured(received.bus, received.frame, &mut intake.group_senders);
+        let received = match &found {
+            GroupFrame::Other => received,
+            GroupFrame::Configured(frame) => ReceivedFrame { frame, ..received },
+            GroupFrame::OfAnotherSender => return,
+        };
         let ReceivedFrame { bus, frame, .. } = received;
         let now = clock.now;
         let Some(admission) = intake.admit(now, bus, frame, out) else { return };

@@ -9,7 +9,7 @@ use super::evidence::usage::UsageRecord;
 use super::other_current::OtherCurrent;
 use super::plan::SignalPlan;
 use super::plan::{InterfacePlan, Plan, Witness};
-use crate::can::decode::{Binding, ParameterGroups};
+use crate::can::decode::{Binding, GroupFrame, GroupSenders, ParameterGroups};
 use crate::can::e2e::Status;
 use crate::can::guard::Guards;
 use crate::can::uds::{Answer, FrameOutcome, Listener, Question};
@@ -100,6 +100,7 @@ pub struct WiringObserver {
     pub(crate) other_currents: BTreeMap<BusIndex, OtherCurrent>,
     /// Messages that any J1939 source address may send.
     groups: ParameterGroups,
+    group_senders: GroupSenders,
     /// Latest direction of a current that is sent as a magnitude, with its time: 1 = discharge, -1 = charge, `None` =
     /// unknown. `None` until there is a reading.
     direction: Option<(Timestamp, Option<f64>)>,
@@ -157,6 +158,7 @@ impl WiringObserver {
             by_question.keys().map(|question| Answer { question: *question, signals: Vec::new() }).collect();
         Self {
             groups: ParameterGroups::new(plan.signals.iter().map(|signal| &signal.binding)),
+            group_senders: GroupSenders::default(),
             direction: None,
             listener: Listener::new(&answers),
             by_question,
@@ -190,8 +192,8 @@ impl WiringObserver {
 
     /// Handles a frame from any interface.
     pub fn handle_frame(&mut self, time: Timestamp, bus: BusIndex, frame: &Frame) {
-        let configured = self.groups.configured(bus, frame);
-        let frame = configured.as_ref().unwrap_or(frame);
+        let found = self.groups.configured(bus, frame, &mut self.group_senders);
+        let frame = if let GroupFrame::Configured(configured) = &found { configured } else { frame };
         self.note_time(time);
         self.frames += 1;
         let Some(stats) = self.buses.get_mut(bus.index()) else { return };

@@ -84,7 +84,7 @@ impl Field {
             let field = Self { byte, bytes: 0, shift: 0, bits: 0, big_endian, number, constant, offset, factor };
             return Ok((factor == 0.0).then_some(field));
         }
-        let bytes = (shift + bits).div_ceil(8) as usize;
+        let bytes = shift.saturating_add(bits).div_ceil(8) as usize;
         let is_number = shift < 8 && (1..=64).contains(&bits) && bytes <= 8;
         let is_float = number != NumberType::Float || matches!((shift, bits), (0, 32 | 64));
         if !is_number || !is_float {

@@ -105,7 +105,7 @@ impl Busmaster {
             Mode::Relative => self.latest_ns = self.latest_ns.checked_add(written_ns)?,
             Mode::System => {
                 let day_ns = self.latest_ns - self.latest_ns.rem_euclid(DAY_NS);
-                let is_next_day = day_ns + written_ns < self.latest_ns - DAY_NS / 2;
+                let is_next_day = day_ns.checked_add(written_ns)? < self.latest_ns - DAY_NS / 2;
                 self.latest_ns = day_ns.checked_add(written_ns)?.checked_add(if is_next_day { DAY_NS } else { 0 })?;
             }
         }

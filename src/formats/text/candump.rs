@@ -249,9 +249,12 @@ pub(super) fn is_screen_line(line: &[u8]) -> bool {
 
 /// Whether the stamps of a log are the times since the previous frames (`-td`).
 ///
-/// Such stamps have fewer than ten digits of seconds and do not increase. Stamps of `-tz`, which count from the first
-/// frame, decrease only where the frames of several interfaces are out of order.
+/// Such stamps have fewer than ten digits of seconds. More than a quarter of them is smaller than the stamp before, or they
+/// do not grow. Stamps of `-tz`, which count from the first frame, grow, and decrease only where the frames of several
+/// interfaces are out of order. Equal stamps say nothing, because recorders with a coarse clock write them too.
 pub(super) fn has_deltas(head: &[u8]) -> bool {
+    /// Number of stamps from which it counts that they do not grow.
+    const FEWEST_STAMPS: usize = 16;
     let stamp = |line: &[u8]| {
         let plain = without_escapes(line);
         let rest = plain.trim_ascii_start().strip_prefix(b"(")?;
@@ -260,8 +263,10 @@ pub(super) fn has_deltas(head: &[u8]) -> bool {
         scaled(stamp, 9).filter(|_| seconds < 10)
     };
     let stamps: Vec<i64> = head.split(|&byte| byte == b'\n').filter_map(stamp).collect();
-    let decreases = stamps.windows(2).filter(|pair| pair[1] <= pair[0]).count();
-    4 * decreases > stamps.len()
+    let decreases = stamps.windows(2).filter(|pair| pair[1] < pair[0]).count();
+    let (first, last) = stamps.split_at(stamps.len() / 2);
+    let grow = first.iter().max() < last.iter().max();
+    4 * decreases > stamps.len() || stamps.len() >= FEWEST_STAMPS && !grow
 }
 
 /// Removes the escape sequences that set colours.

@@ -23,8 +23,9 @@ impl ToolLog {
     /// Fails if the source cannot be read, or if it has a known format that packwatch does not read. The error then
     /// names the format and a converter.
     pub(super) fn recognise(lines: &mut Lines) -> io::Result<Option<Format>> {
-        if begins_with_unix_stamp(lines.peek()?) {
-            // A candump log or journal. A live source must not wait until it has sent a whole head.
+        let first = lines.peek()?;
+        if first.starts_with(b"PACKWATCH-JOURNAL") || begins_with_unix_stamp(first) {
+            // A journal or a candump log. A live source must not wait until it has sent a whole head.
             return Ok(None);
         }
         let head = lines.peek_bytes(Format::HEAD_BYTES)?;

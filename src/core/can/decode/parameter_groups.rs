@@ -2,10 +2,13 @@
 //!
 //! A DBC gives one identifier, with one source address, to a parameter group. On the bus, the source address is the one
 //! that the sender has claimed. Such a frame is therefore handled as a frame with the configured identifier. If several
-//! configured messages belong to one group, each is found by its own identifier only.
+//! configured messages belong to one group, each is found by its own identifier only. The same holds for groups with a
+//! destination, such as EF00, which any node uses for its own purposes.
+//!
+//! Several packs on one bus send the same groups. The frames of one of them are used ([`GroupSenders`]).
 
 use super::Binding;
-use crate::can::j1939::{any_source, parameter_group};
+use crate::can::j1939::{any_source, has_destination, parameter_group};
 use crate::can::{CanId, Frame};
 use crate::quantity::BusIndex;
 
@@ -22,6 +25,7 @@ impl ParameterGroups {
         let mut groups: Vec<_> = bindings
             .into_iter()
             .filter_map(|of| Some((of.bus, parameter_group(of.id)?, of.id, of.of_any_source)))
+            .filter(|(_, group, ..)| !has_destination(*group))
             .collect();
         groups.sort_unstable();
         groups.dedup();
@@ -32,11 +36,17 @@ impl ParameterGroups {
         Self { groups: alone.collect() }
     }
 
-    /// The frame with the identifier of the configured message that it carries; `None` = the frame keeps its
-    /// identifier.
+    /// Finds the configured message that a frame carries.
     #[inline]
-    pub fn configured(&self, bus: BusIndex, frame: &Frame) -> Option<Frame> {
-        if self.groups.is_empty() { None } else { self.find(bus, frame.id()).map(|id| frame.with_id(id)) }
+    pub fn configured(&self, bus: BusIndex, frame: &Frame, senders: &mut GroupSenders) -> GroupFrame {
+        if self.groups.is_empty() {
+            return GroupFrame::Other;
+        }
+        match self.find(bus, frame.id()) {
+            None => GroupFrame::Other,
+            Some(id) if senders.is_chosen(bus, id, frame.id()) => GroupFrame::Configured(frame.with_id(id)),
+            Some(_) => GroupFrame::OfAnotherSender,
+        }
     }
 
     fn find(&self, bus: BusIndex, id: CanId) -> Option<CanId> {
@@ -51,6 +61,37 @@ impl ParameterGroups {
     }
 }
 
+/// A received frame, compared with the configured groups.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum GroupFrame {
+    /// The frame belongs to no group and keeps its identifier.
+    Other,
+    /// The frame with the identifier of the configured message.
+    Configured(Frame),
+    /// The frame has a configured group, but another sender is used.
+    OfAnotherSender,
+}
+
+/// The sender that is used for each group: the configured source address as soon as it sends, until then the first
+/// address that sends the group. A restart begins anew.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct GroupSenders {
+    /// Interface, configured identifier, identifier of the sender in use.
+    chosen: Vec<(BusIndex, CanId, CanId)>,
+}
+
+impl GroupSenders {
+    fn is_chosen(&mut self, bus: BusIndex, configured: CanId, sent: CanId) -> bool {
+        let source = |id: CanId| id.raw() & 0xFF;
+        match self.chosen.iter_mut().find(|(of, id, _)| (*of, *id) == (bus, configured)) {
+            None => self.chosen.push((bus, configured, sent)),
+            Some((.., chosen)) if source(sent) == source(configured) => *chosen = sent,
+            Some((.., chosen)) => return source(*chosen) == source(sent),
+        }
+        true
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -62,9 +103,27 @@ mod tests {
 
     fn found(bindings: &[Binding], id: CanId) -> Option<CanId> {
         let frame = Frame::classic(id, &[1, 2]).unwrap();
-        let configured = ParameterGroups::new(bindings).configured(BusIndex(0), &frame)?;
-        assert_eq!(configured.data(), frame.data());
-        Some(configured.id())
+        match ParameterGroups::new(bindings).configured(BusIndex(0), &frame, &mut GroupSenders::default()) {
+            GroupFrame::Configured(configured) => {
+                assert_eq!(configured.data(), frame.data());
+                Some(configured.id())
+            }
+            GroupFrame::Other => None,
+            GroupFrame::OfAnotherSender => panic!("no sender was chosen"),
+        }
+    }
+
+    #[test]
+    fn one_sender_of_group_is_used() {
+        let groups = ParameterGroups::new(&[message(0x18FF_50FE, true)]);
+        let mut senders = GroupSenders::default();
+        let mut is_used = |id: u32| {
+            let frame = Frame::classic(CanId::Extended(id), &[1]).unwrap();
+            matches!(groups.configured(BusIndex(0), &frame, &mut senders), GroupFrame::Configured(_))
+        };
+        // The first sender is used until the configured one sends.
+        assert_eq!([0x18FF_50F3, 0x18FF_50F4, 0x18FF_50F3].map(&mut is_used), [true, false, true]);
+        assert_eq!([0x18FF_50FE, 0x18FF_50F3, 0x18FF_50FE].map(&mut is_used), [true, false, true]);
     }
 
     #[test]
@@ -76,8 +135,8 @@ mod tests {
         for sent in [CanId::Extended(0x18FF_51F4), CanId::Extended(0x19FF_50F4), CanId::Standard(0x4FE)] {
             assert_eq!(found(std::slice::from_ref(&any), sent), None, "{sent}");
         }
-        // The group EF00 has a destination, which is not a part of the group's number.
-        assert!(found(&[message(0x18EF_FFFE, true)], CanId::Extended(0x18EF_12F4)).is_some());
+        // Any node uses the group EF00 with a destination for its own purposes.
+        assert_eq!(found(&[message(0x18EF_21FE, true)], CanId::Extended(0x18EF_21F4)), None);
     }
 
     #[test]
@@ -89,9 +148,9 @@ mod tests {
 
     #[test]
     fn patterns_pass_any_source_of_group() {
-        let groups = ParameterGroups::new(&[message(0x18FF_50FE, true), message(0x18EF_FFFE, true)]);
+        let groups = ParameterGroups::new(&[message(0x18FF_50FE, true), message(0x18EF_21FE, true)]);
         let passes = |id: u32| groups.patterns(BusIndex(0)).any(|(wanted, mask)| id & mask == wanted);
-        for (id, wanted) in [(0x18FF_50F4, true), (0x0CFF_5000, true), (0x18FF_51F4, false), (0x18EF_12F4, true)] {
+        for (id, wanted) in [(0x18FF_50F4, true), (0x0CFF_5000, true), (0x18FF_51F4, false), (0x18EF_21F4, false)] {
             assert_eq!(passes(id), wanted, "{id:X}");
         }
         assert_eq!(groups.patterns(BusIndex(1)).count(), 0);

@@ -74,11 +74,14 @@ pub fn parameter_group(id: CanId) -> Option<u32> {
     Header::of(id).map(|header| header.pgn)
 }
 
-/// Identifier and mask of one group from any source to any destination with any priority.
+/// Whether frames of a group have a destination.
+pub(crate) fn has_destination(pgn: u32) -> bool {
+    pgn >> 8 & 0xFF < u32::from(FIRST_BROADCAST_FORMAT)
+}
+
+/// Identifier and mask of one group without a destination, from any source with any priority.
 pub(crate) fn any_source(pgn: u32) -> (u32, u32) {
-    let (id, mask) = filter(pgn, 0);
-    let has_destination = pgn >> 8 & 0xFF < u32::from(FIRST_BROADCAST_FORMAT);
-    (id, if has_destination { mask & !0xFF00 } else { mask })
+    filter(pgn, 0)
 }
 
 /// A PGN in a payload: three bytes, lowest first.

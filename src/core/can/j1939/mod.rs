@@ -38,11 +38,11 @@ mod trouble_code;
 
 pub use codes::ActiveCode;
 pub use event::NodeEvent;
-pub(crate) use id::any_source;
 pub use id::{
     GLOBAL_ADDRESS, MAX_ADDRESS, NULL_ADDRESS, PGN_ACKNOWLEDGEMENT, PGN_ADDRESS_CLAIMED, PGN_DM1, PGN_DM2, PGN_REQUEST,
     PGN_TRANSPORT_CONTROL, PGN_TRANSPORT_DATA, parameter_group,
 };
+pub(crate) use id::{any_source, has_destination};
 pub use name::{Name, NameFields, OutOfRange};
 pub use node::{Node, NodeConfig, NodeOutputs};
 pub use trouble_code::{DmPayload, Lamp, LampState, Lamps, MAX_CODES, TroubleCode, dm_payload};

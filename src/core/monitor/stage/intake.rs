@@ -13,6 +13,7 @@ use buses::Buses;
 use command_gate::CommandGate;
 
 use crate::alarm::{Observation, Rule, Selector, Severity};
+use crate::can::decode::GroupSenders;
 use crate::can::e2e::Status;
 use crate::can::encode::{self, CommandFields, CommandRefusal};
 use crate::can::flood::{FloodCount, FloodGate, FloodProgress};
@@ -35,6 +36,8 @@ pub(crate) struct Intake {
     gate: FloodGate,
     guards: Guards,
     pub(crate) senders: SecondSenders,
+    /// Senders of J1939 groups. They are not stored.
+    pub(crate) group_senders: GroupSenders,
     pub(crate) own: OwnFrames,
     buses: Buses,
     /// Gate of authenticated commands.
@@ -125,6 +128,7 @@ impl Intake {
             gate: FloodGate::new(&config.flood, config.input.messages().chain(commands).chain(answers)),
             guards: Guards::new(config.guards.clone()),
             senders: SecondSenders::new(config.unprotected()),
+            group_senders: GroupSenders::default(),
             own: OwnFrames::new(config.own_ids()),
             buses: Buses::default(),
             command_gate: CommandGate::default(),

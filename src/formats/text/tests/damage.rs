@@ -104,6 +104,13 @@ fn large_times_and_backward_steps_are_kept() {
 }
 
 #[test]
+fn time_of_day_beyond_any_clock_is_bad() {
+    let head = "***BUSMASTER Ver 3.2.2***\n***START DATE AND TIME 14:11:2023 22:13:20:000***\n***SYSTEM MODE***\n";
+    let log = format!("{head}{}", "2562046:00:00:0000 Rx 1 0x100 s 1 05\n".repeat(3));
+    assert!(frames(Format::Busmaster, log.as_bytes()).len() < 3, "no time is beyond the range of stamps");
+}
+
+#[test]
 fn channels_beyond_the_limit_are_refused() {
     let lines: String = (0..300).map(|n| format!("0.5 {} 100 Rx d 0\n", n + 1)).collect();
     let seen = content(format!("base hex timestamps absolute\n{lines}").as_bytes());

@@ -207,18 +207,20 @@ fn candump_screen_lines_give_their_frames() {
 
 #[test]
 fn candump_deltas_are_added_up_in_text_and_logs() {
-    let text = " (000.000000)  can0  100   [1]  01\n (000.001000)  can0  100   [1]  02\n (000.001000)  can0  100   [1]  03\n (000.000500)  can0  100   [1]  04\n";
+    let text = " (000.000000)  can0  100   [1]  01\n (000.001000)  can0  100   [1]  02\n (000.000500)  can0  100   [1]  03\n (000.000400)  can0  100   [1]  04\n";
     assert_eq!(Format::recognise(text.as_bytes()), Some(Format::CandumpDeltas));
-    let expected = ["0 can0 100 01", "0.001 can0 100 02", "0.002 can0 100 03", "0.0025 can0 100 04"];
+    let expected = ["0 can0 100 01", "0.001 can0 100 02", "0.0015 can0 100 03", "0.0019 can0 100 04"];
     check(text, &expected);
     let log =
-        "(000.000000) can0 100#01\n(000.001000) can0 100#02\n(000.001000) can0 100#03\n(000.000500) can0 100#04\n";
+        "(000.000000) can0 100#01\n(000.001000) can0 100#02\n(000.000500) can0 100#03\n(000.000400) can0 100#04\n";
     check(log, &expected);
-    let forms = "(000.000000) can0 18FF1234##3010203\n(000.001000) can0 100#R4\n(000.001000) can0 20000004#0004\n(000.000500) can0 100#11.22\n(000.000500) can0 00123#81:00:12345678#11\n";
+    let forms = "(000.000000) can0 18FF1234##3010203\n(000.001000) can0 100#R4\n(000.000500) can0 20000004#0004\n(000.000400) can0 100#11.22\n(000.000300) can0 00123#81:00:12345678#11\n";
     check(
         forms,
-        &["0 can0 18FF1234 FBE 01 02 03", "0.001 can0 100 R4", "0.002 can0 error 4", "0.0025 can0 100 11 22", "XL"],
+        &["0 can0 18FF1234 FBE 01 02 03", "0.001 can0 100 R4", "0.0015 can0 error 4", "0.0019 can0 100 11 22", "XL"],
     );
+    let equal = "(000.010000) can0 100#01\n".repeat(20);
+    assert_eq!(Format::recognise(equal.as_bytes()), Some(Format::CandumpDeltas), "the stamps do not grow");
 }
 
 #[test]
@@ -226,7 +228,8 @@ fn candump_logs_from_zero_or_1970_are_left_to_their_reader() {
     let zero = "(000.000000) can0 100#01\n(000.001000) can0 100#02\n(001.001000) can1 100#03\n(001.000500) can0 100#04\n(001.100500) can0 100#04\n";
     let absolute =
         "(1700000000.000000) can0 100#01 R\n(1700000000.000000) can0 100#02 T\n(1700000000.000000) can0 100#02 T\n";
-    for log in [zero, absolute, "PACKWATCH-JOURNAL 1\ndate Tue Nov 14 22:13:20 2023\n"] {
+    let coarse: String = (0..40).map(|n| format!("(000.{:02}0000) can0 100#{n:02X}\n", n / 4)).collect();
+    for log in [zero, absolute, &coarse, "PACKWATCH-JOURNAL 1\ndate Tue Nov 14 22:13:20 2023\n"] {
         assert_eq!(Format::recognise(log.as_bytes()), None, "{log}");
     }
 }
