@@ -6,7 +6,7 @@ use crate::{Format, Item};
 /// A short log of each format.
 const LOGS: [&str; 10] = [
     " (1700000000.000000)  can0  RX - -  100   [2]  05 A2\n (1700000000.001000)  can0  RX B -  18FF1234  [03]  05 00 A2\n",
-    "(000.000000) can0 100#0501\n(000.001000) can0 110#DE0F\n(000.000500) can0 100#2100\n(000.000500) can0 18FF1234##1210011\n",
+    "(000.000000) can0 100#0501\n(000.001000) can0 110#DE0F\n(000.000500) can0 100#2100\n(000.000400) can0 18FF1234##1210011\n",
     "date Tue Nov 14 10:13:20.000 pm 2023\nbase dec  timestamps absolute\n 0.1 1  256 Rx   d 2 162 19  Length = 1\n 0.2 CANFD 1 Rx 100 Name 1 0 3 3 16 255 101 0 0 1000\n",
     ";$FILEVERSION=2.1\r\n;$STARTTIME=45244.925\r\n;$COLUMNS=N,O,T,B,I,d,R,L,D\r\n 1 0.000 DT 1 0100 Rx - 2 05 A2\r\n 2 1.000 FD 1 18FF1234 Rx - 3 05 A2 01\r\n",
     "Time Stamp,ID,Extended,Dir,Bus,LEN,D1,D2\n1000,100,false,Rx,0,2,05,A2,\n2000,18FF1234,true,Rx,1,2,05,A2,\n",
