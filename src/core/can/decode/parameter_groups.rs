@@ -55,6 +55,11 @@ impl ParameterGroups {
         Some(self.groups[place].2)
     }
 
+    /// Whether frames of any source address carry this configured message.
+    pub fn has_any_source(&self, bus: BusIndex, id: CanId) -> bool {
+        self.find(bus, id) == Some(id)
+    }
+
     /// Identifiers and masks of the extended frames that an interface must receive.
     pub fn patterns(&self, bus: BusIndex) -> impl Iterator<Item = (u32, u32)> + '_ {
         self.groups.iter().filter(move |group| group.0 == bus).map(|group| any_source(group.1))

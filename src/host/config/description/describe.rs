@@ -6,6 +6,7 @@ use serde::Serialize;
 
 use super::traffic::{self, OutputUse};
 use crate::alarm::{Comparison, Direction, Rule, RuleConfig, Unit};
+use crate::can::CanId;
 use crate::can::dbc::Message;
 use crate::can::signal::{ByteOrder, ValueType};
 use crate::cell::CellModel;
@@ -205,9 +206,14 @@ fn pack(config: &Config, voltage_step_v: f64, rounding_v: f64) -> Vec<String> {
 }
 
 fn interface(bus: BusIndex, interface: &InterfaceConfig, config: &Config) -> InterfaceUse {
-    let filter_ids: Vec<_> = config.monitor.listened_ids(bus).iter().map(ToString::to_string).collect();
-    let all = config.monitor.wanted_ids(bus).into_iter().map(|id| id.to_string());
-    let own_ids = all.filter(|id| !filter_ids.contains(id)).collect();
+    let groups = config.monitor.input.groups();
+    let named = |id: &CanId| match groups.has_any_source(bus, *id) {
+        true => format!("{id} (any source address)"),
+        false => id.to_string(),
+    };
+    let filter_ids: Vec<_> = config.monitor.listened_ids(bus).iter().map(named).collect();
+    let all: Vec<_> = config.monitor.wanted_ids(bus).iter().map(named).collect();
+    let own_ids = all.into_iter().filter(|id| !filter_ids.contains(id)).collect();
     InterfaceUse { name: interface.name.clone(), fd: interface.fd, filter_ids, own_ids }
 }
 
