@@ -1,6 +1,8 @@
 //! Tests definitions as they occur in the field: a faulty message in a DBC, J1939 source addresses, and a current whose
 //! direction is in another signal.
 
+use packwatch_core::can::decode::{GroupFrame, GroupSenders};
+
 use super::*;
 
 fn read(pack: &str, dbc: &str) -> Result<Config, Vec<String>> {
@@ -51,7 +53,10 @@ fn j1939(format: &str) -> String {
 /// The identifier of the frame after its parameter group was looked up.
 fn configured(config: &Config, sent: u32) -> u32 {
     let frame = Frame::classic(CanId::Extended(sent), &[0; 8]).unwrap();
-    config.monitor.input.groups().configured(BusIndex(0), &frame).unwrap_or(frame).id().raw()
+    match config.monitor.input.groups().configured(BusIndex(0), &frame, &mut GroupSenders::default()) {
+        GroupFrame::Configured(frame) => frame.id().raw(),
+        GroupFrame::Other | GroupFrame::OfAnotherSender => sent,
+    }
 }
 
 #[test]
