@@ -1,5 +1,5 @@
 //! Reads logs of any format as one stream of core inputs: journals, candump logs, logs of other tools and CSV,
-//! uncompressed or as gzip or zstd.
+//! uncompressed or as gzip or zstd. Without the feature `formats`, only journals and candump logs are read.
 //!
 //! The first bytes decide the format; for CSV, the file name decides too. Several logs are read one after another on
 //! one clock. A log, or a CSV section without a start time, may begin before the latest record read so far. In that
@@ -310,7 +310,11 @@ impl LogSource {
             return Err(LogError::Data(format!("{name}:1: found {found:?}, must be {:?}", journal::HEADER)));
         }
         let csv = !journal && csv_log::is_table(path, after_remarks(lines.unread()));
-        let form = if csv {
+        let form = if csv && !cfg!(feature = "formats") {
+            let reason =
+                "is a table, and the vehicle's program reads only candump logs and journals; use the full program";
+            return Err(LogError::Data(format!("{name}: {reason}")));
+        } else if csv {
             let log = CsvLog::open(Box::new(lines.into_reader()), path, &self.csv)?;
             self.state.counts.tables.push(log.reading().clone());
             LogForm::Csv(Box::new(log))
