@@ -5,6 +5,7 @@ mod estimates;
 mod mcap;
 mod output;
 
+use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
 
@@ -13,7 +14,7 @@ use packwatch_host::failure::Failure;
 use self::output::{Format, Output};
 use super::common::logs::{InputArgs, log_options};
 use super::common::numbers::{NamedValue, one_of};
-use super::common::output::{failure, named};
+use super::common::output::{failure, named, unless_closed};
 use super::common::progress::Bar;
 use crate::config::{self, Config};
 use crate::io::csv_log::CsvOptions;
@@ -84,7 +85,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     if let (true, Some(config)) = (has_estimates, config) {
         output = estimates::write(args, config, output)?;
     }
-    output.finish().map_err(failure)?;
+    unless_closed(output.finish())?;
     eprintln!("{}", summary.text(&args.out));
     Ok(())
 }
@@ -121,19 +122,22 @@ fn write_frames(args: &Args, config: Option<&Config>, output: &mut Output) -> Re
     source.adopt_foreign();
     let (bar, mut summary, mut records) = (Bar::new(&args.logs), Summary::default(), 0_u64);
     while let Some(record) = source.next_record().map_err(failure)? {
-        match &record.kind {
+        let written = match &record.kind {
             RecordKind::Frame { bus, frame } | RecordKind::SecuredFrame { bus, frame, .. } => {
-                output.write_frame(record.time, *bus, source.interfaces(), frame).map_err(failure)?;
                 summary.frames += 1;
-                summary.note(record.time);
+                output.write_frame(record.time, *bus, source.interfaces(), frame)
             }
             RecordKind::Bus { bus, event: BusEvent::ErrorFrame { class } } => {
-                output.write_error_frame(record.time, *bus, source.interfaces(), *class).map_err(failure)?;
                 summary.error_frames += 1;
-                summary.note(record.time);
+                output.write_error_frame(record.time, *bus, source.interfaces(), *class)
             }
-            _ => {}
+            _ => continue,
+        };
+        summary.note(record.time);
+        if written.as_ref().is_err_and(|error| error.kind() == io::ErrorKind::BrokenPipe) {
+            break;
         }
+        written.map_err(failure)?;
         records += 1;
         if records.is_multiple_of(REPORT_EVERY) {
             let bytes = source.read_bytes().load(Ordering::Relaxed);

@@ -14,6 +14,7 @@ use packwatch_core::quantity::Timestamp;
 use self::container::Containers;
 use crate::byte_stream::{ByteStream, WINDOW, cut, damaged, u16_at, u32_at};
 use crate::channel_list::ChannelList;
+use crate::text::date::midnight;
 use crate::{Channel, Item, LogReader, Position, Source};
 
 /// First bytes of a file.
@@ -52,7 +53,7 @@ impl BlfReader {
             return Err(damaged(format!("header of {size} bytes, must be {HEADER_FIELDS} to {WINDOW} (usual: 144)")));
         }
         let date = std::array::from_fn(|part| u16_at(head, 40 + 2 * part, false));
-        let start_ns = unix_ms(date).map_or(0, |ms| ms.saturating_mul(1_000_000));
+        let start_ns = unix_ns(date).unwrap_or(0);
         file.skip(size as u64)?;
         let objects = ByteStream::new(Containers::new(file));
         Ok(Self { objects, start_ns, channels: ChannelList::default(), is_lost: false })
@@ -130,19 +131,15 @@ impl LogReader for BlfReader {
     }
 }
 
-/// Milliseconds from 1970 to a date: year, month, day of the week, day, hour, minute, second, millisecond. The date has
+/// Nanoseconds from 1970 to a date: year, month, day of the week, day, hour, minute, second, millisecond. The date has
 /// no time zone and is read as UTC, as other readers do. `None` = not a date.
-fn unix_ms([year, month, _, day, hour, minute, second, millisecond]: [u16; 8]) -> Option<i64> {
-    let is_date = year >= 1970 && (1..=12).contains(&month) && (1..=31).contains(&day);
-    let is_time = hour < 24 && minute < 60 && second <= 60 && millisecond < 1000;
-    if !is_date || !is_time {
+fn unix_ns([year, month, _, day, hour, minute, second, millisecond]: [u16; 8]) -> Option<i64> {
+    if hour >= 24 || minute >= 60 || second > 60 || millisecond >= 1000 {
         return None;
     }
-    // Days since 1 March of year 0: the leap day is the last day of its year.
-    let (year, month) = (i64::from(year) - i64::from(month < 3), (i64::from(month) + 9) % 12);
-    let days = 365 * year + year / 4 - year / 100 + year / 400 + (153 * month + 2) / 5 + i64::from(day) - 1 - 719_468;
-    let seconds = ((days * 24 + i64::from(hour)) * 60 + i64::from(minute)) * 60 + i64::from(second);
-    Some(seconds * 1000 + i64::from(millisecond))
+    let midnight_ns = midnight(year.into(), month.into(), day.into())?;
+    let seconds = (i64::from(hour) * 60 + i64::from(minute)) * 60 + i64::from(second);
+    midnight_ns.checked_add((seconds * 1000 + i64::from(millisecond)) * 1_000_000)
 }
 
 /// Time of an object, rounded to a microsecond: writers compute the offset from floating-point Unix times.

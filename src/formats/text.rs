@@ -10,7 +10,7 @@ mod canking;
 mod crtd;
 mod css;
 mod cursor;
-mod date;
+pub(crate) mod date;
 mod gvret;
 mod lines;
 mod python_can;

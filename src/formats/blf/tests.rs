@@ -3,7 +3,7 @@
 use packwatch_core::can::{CanId, Frame};
 use packwatch_core::quantity::Timestamp;
 
-use super::unix_ms;
+use super::unix_ns;
 use crate::testing::{assert_cuts_keep_frames, assert_damage_is_survived, fd_frame, frame, read, zlib};
 use crate::{Channel, Item, Position};
 
@@ -182,8 +182,8 @@ fn noise_below_a_microsecond_is_rounded_away() {
 
 #[test]
 fn date_gives_unix_time() {
-    assert_eq!(unix_ms([2023, 11, 2, 14, 22, 13, 20, 500]), Some(START_MS));
-    assert_eq!(unix_ms([1970, 1, 4, 1, 0, 0, 0, 0]), Some(0));
-    assert_eq!(unix_ms([2024, 2, 4, 29, 23, 59, 59, 999]), Some(1_709_251_199_999));
-    assert_eq!(unix_ms([0; 8]), None);
+    assert_eq!(unix_ns([2023, 11, 2, 14, 22, 13, 20, 500]), Some(START_MS * 1_000_000));
+    assert_eq!(unix_ns([1970, 1, 4, 1, 0, 0, 0, 0]), Some(0));
+    assert_eq!(unix_ns([2024, 2, 4, 29, 23, 59, 59, 999]), Some(1_709_251_199_999_000_000));
+    assert_eq!(unix_ns([0; 8]), None);
 }

@@ -61,7 +61,7 @@ pub(super) fn parse(text: &[u8]) -> Option<i64> {
 }
 
 /// Time of the start of a day, ns since 1970. `None` if the day does not exist or is out of range.
-pub(super) fn midnight(year: i64, month: i64, day: i64) -> Option<i64> {
+pub(crate) fn midnight(year: i64, month: i64, day: i64) -> Option<i64> {
     let is_leap = year % 4 == 0 && (year % 100 != 0 || year % 400 == 0);
     let last = match month {
         4 | 6 | 9 | 11 => 30,
