@@ -54,6 +54,10 @@ pub fn foreign(head: &[u8]) -> Option<(&'static str, &'static str)> {
         return Some(("Vehicle Spy CSV", VIA_SAVVYCAN));
     } else if first_has(b"canhacker") || first.starts_with(b"@ text @") {
         return Some(("CANHacker or CARBUS trace", VIA_SAVVYCAN));
+    } else if contains(b"Microchip Technology Inc.") {
+        return Some(("Microchip CAN BUS Analyzer log", VIA_SAVVYCAN));
+    } else if first.starts_with(b"id,data bytes") {
+        return Some(("list of frames without times", "record the frames with their times, for example as GVRET CSV"));
     } else if first_has(b"ixxat") {
         return Some(("IXXAT trace", VIA_SAVVYCAN));
     }

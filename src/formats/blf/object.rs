@@ -106,9 +106,10 @@ fn fd_64(body: &[u8]) -> Result<Frame, String> {
     if flags & 0x10 != 0 {
         return raw(id, true, None, &[0; 8][..length_of_code(code, false)]).check();
     }
-    let len = usize::from(valid);
-    let data = body.get(40..40 + len).ok_or_else(|| missing(len, body.len() - 40))?;
-    raw(id, false, fd, data).check()
+    // As in Vector's own library, bytes that the object does not store are zero.
+    let (len, mut data) = (usize::from(valid), [0; 64]);
+    data.iter_mut().zip(body[40..].iter().take(len)).for_each(|(to, from)| *to = *from);
+    raw(id, false, fd, data.get(..len).ok_or_else(|| missing(len, body.len() - 40))?).check()
 }
 
 fn raw(id: u32, remote: bool, fd: Option<(bool, bool)>, data: &[u8]) -> RawFrame<'_> {

@@ -111,6 +111,18 @@ fn every_object_of_a_bus_becomes_its_frame() {
 }
 
 #[test]
+fn bytes_that_are_not_stored_are_zero() {
+    let mut body = vec![3, 15, 64, 0];
+    body.extend((0x8000_0000_u32 | 0x1234).to_le_bytes());
+    body.extend([0, 0, 0, 0]);
+    body.extend(0x3000_u32.to_le_bytes());
+    body.resize(40, 0);
+    body.extend([7; 48]);
+    let log = read(&file(&[object(101, 2, 0, &body)]));
+    assert_eq!(log.frames()[0].2, fd_frame(0x1234, &[&[7; 48][..], &[0; 16]].concat()));
+}
+
+#[test]
 fn object_continues_in_next_container() {
     let content = messages(4);
     let whole = read(&file(&[container(&content, 2)])).frames();

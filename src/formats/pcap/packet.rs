@@ -100,7 +100,11 @@ fn frame(bytes: &[u8], big_endian: bool, is_fd: bool, time: Timestamp, channel: 
     if bytes.len() < FRAME_HEAD {
         return Err(format!("CAN frame of {} bytes, must have at least {FRAME_HEAD}", bytes.len()));
     }
-    let (id, len, flags) = (u32_at(bytes, 0, big_endian), usize::from(bytes[4]), bytes[5]);
+    let (len, flags) = (usize::from(bytes[4]), bytes[5]);
+    // Some recorders use the other byte order. The identifier of an 11-bit frame then looks too large.
+    let orders = [big_endian, !big_endian].map(|order| u32_at(bytes, 0, order));
+    let is_possible = |id: &u32| id & EXTENDED != 0 || id & (ERROR - 1) <= 0x7FF;
+    let id = orders.into_iter().find(is_possible).unwrap_or(orders[0]);
     // The flags of CAN XL lie where other frames have their length, which is at most 64.
     if bytes[4] & XL != 0 {
         return Ok(Item::Xl);

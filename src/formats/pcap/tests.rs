@@ -101,6 +101,12 @@ fn both_byte_orders_and_units_give_same_frames() {
 }
 
 #[test]
+fn identifier_in_wrong_order_is_turned() {
+    let log = read(&pcap(false, false, 227, &[can(0x123_u32.to_le_bytes(), 0, &[1, 2, 3])]));
+    assert_eq!(log.items, items([0; 3])[..1]);
+}
+
+#[test]
 fn cooked_packets_have_identifier_in_order_of_recorder() {
     for big_endian in [false, true] {
         let sll = |protocol: u16, body: &[u8]| {

@@ -251,7 +251,8 @@ pub(super) fn is_screen_line(line: &[u8]) -> bool {
 ///
 /// Such stamps have fewer than ten digits of seconds. More than a quarter of them is smaller than the stamp before, or they
 /// do not grow. Stamps of `-tz`, which count from the first frame, grow, and decrease only where the frames of several
-/// interfaces are out of order. Equal stamps say nothing, because recorders with a coarse clock write them too.
+/// interfaces are out of order. Equal stamps say nothing, because recorders with a coarse clock write them too; neither do
+/// whole seconds that do not grow.
 pub(super) fn has_deltas(head: &[u8]) -> bool {
     /// Number of stamps from which it counts that they do not grow.
     const FEWEST_STAMPS: usize = 16;
@@ -266,7 +267,8 @@ pub(super) fn has_deltas(head: &[u8]) -> bool {
     let decreases = stamps.windows(2).filter(|pair| pair[1] < pair[0]).count();
     let (first, last) = stamps.split_at(stamps.len() / 2);
     let grow = first.iter().max() < last.iter().max();
-    4 * decreases > stamps.len() || stamps.len() >= FEWEST_STAMPS && !grow
+    let is_coarse = stamps.iter().all(|stamp| stamp % 1_000_000_000 == 0);
+    4 * decreases > stamps.len() || stamps.len() >= FEWEST_STAMPS && !grow && !is_coarse
 }
 
 /// Removes the escape sequences that set colours.

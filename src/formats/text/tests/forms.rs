@@ -229,7 +229,8 @@ fn candump_logs_from_zero_or_1970_are_left_to_their_reader() {
     let absolute =
         "(1700000000.000000) can0 100#01 R\n(1700000000.000000) can0 100#02 T\n(1700000000.000000) can0 100#02 T\n";
     let coarse: String = (0..40).map(|n| format!("(000.{:02}0000) can0 100#{n:02X}\n", n / 4)).collect();
-    for log in [zero, absolute, &coarse, "PACKWATCH-JOURNAL 1\ndate Tue Nov 14 22:13:20 2023\n"] {
+    let seconds = "(166.000000) can0 100#01\n".repeat(20);
+    for log in [zero, absolute, &coarse, &seconds, "PACKWATCH-JOURNAL 1\ndate Tue Nov 14 22:13:20 2023\n"] {
         assert_eq!(Format::recognise(log.as_bytes()), None, "{log}");
     }
 }
@@ -370,5 +371,7 @@ fn foreign_files_are_named_with_a_converter() {
     assert_eq!(name(b"(1700000000.0) can0 100#01\n"), None);
     assert_eq!(name(b"time,addr,bus,data\n0.1,256,0,05\n"), Some("Cabana CSV"));
     assert_eq!(name(b"ASCII Trace IXXAT Automation GmbH\n"), Some("IXXAT trace"));
+    assert_eq!(name(b"ID,Data Bytes\n0000021A,FE 36\n"), Some("list of frames without times"));
+    assert_eq!(name(b"//----\nMicrochip Technology Inc.\nCAN BUS Analyzer\n"), Some("Microchip CAN BUS Analyzer log"));
     assert_eq!(name(b""), None);
 }
