@@ -12,9 +12,8 @@ use std::io::{self, Read};
 use packwatch_core::quantity::Timestamp;
 
 pub(crate) use self::next_generation::{PcapNgReader, SECTION_HEADER};
-use self::packet::LinkType;
+use self::packet::{LinkType, PacketDecoder};
 use crate::byte_stream::{ByteStream, WINDOW, cut, damaged, u32_at};
-use crate::channel_list::ChannelList;
 use crate::{Channel, Item, LogReader, Position, Source};
 
 /// Size of the file header, and of the header of a packet, bytes.
@@ -47,7 +46,7 @@ pub(crate) struct PcapReader {
     packets: ByteStream<Box<dyn Read>>,
     form: Form,
     link: Option<LinkType>,
-    channels: ChannelList,
+    decoder: PacketDecoder,
     /// Offset of the packet read last.
     at: u64,
 }
@@ -71,7 +70,7 @@ impl PcapReader {
             return Err(damaged(packet::other_link_type(number)));
         }
         packets.consume(FILE_HEAD);
-        Ok(Self { packets, form, link, channels: ChannelList::default(), at: 0 })
+        Ok(Self { packets, form, link, decoder: PacketDecoder::default(), at: 0 })
     }
 
     fn next_packet(&mut self) -> io::Result<Option<Item>> {
@@ -95,7 +94,7 @@ impl PcapReader {
         let Some(bytes) = held.get(..len) else {
             return Err(cut(format!("the file ends in a packet of {len} bytes after {}", held.len())));
         };
-        let item = packet::decode(self.link, bytes, self.form.big_endian, time, None, &mut self.channels);
+        let item = self.decoder.decode(self.link, bytes, self.form.big_endian, time, None);
         self.packets.consume(len);
         Ok(Some(item))
     }
@@ -111,7 +110,7 @@ impl LogReader for PcapReader {
     }
 
     fn channels(&self) -> &[Channel] {
-        self.channels.as_slice()
+        self.decoder.channels.as_slice()
     }
 }
 

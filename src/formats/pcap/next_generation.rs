@@ -4,9 +4,8 @@ use std::io::{self, Read};
 
 use packwatch_core::quantity::Timestamp;
 
-use super::packet::{self, LinkType};
+use super::packet::{LinkType, PacketDecoder};
 use crate::byte_stream::{ByteStream, WINDOW, cut, damaged, u16_at, u32_at};
-use crate::channel_list::ChannelList;
 use crate::{Channel, Item, LogReader, Position, Source};
 
 /// First bytes of a section, the same in both byte orders.
@@ -42,7 +41,7 @@ pub(crate) struct PcapNgReader {
     blocks: ByteStream<Box<dyn Read>>,
     big_endian: bool,
     interfaces: Vec<Interface>,
-    channels: ChannelList,
+    decoder: PacketDecoder,
     /// Offset of the block read last.
     at: u64,
 }
@@ -53,7 +52,7 @@ impl PcapNgReader {
             blocks: ByteStream::new(source.reader),
             big_endian: false,
             interfaces: Vec::new(),
-            channels: ChannelList::default(),
+            decoder: PacketDecoder::default(),
             at: 0,
         }
     }
@@ -115,7 +114,7 @@ impl PcapNgReader {
             },
             // A packet without a time cannot be placed.
             SIMPLE_PACKET => Item::Other,
-            _ => packet(content, kind == OLD_PACKET, big_endian, &self.interfaces, &mut self.channels)
+            _ => packet(content, kind == OLD_PACKET, big_endian, &self.interfaces, &mut self.decoder)
                 .unwrap_or_else(Item::Bad),
         };
         self.blocks.consume(len);
@@ -133,7 +132,7 @@ impl LogReader for PcapNgReader {
     }
 
     fn channels(&self) -> &[Channel] {
-        self.channels.as_slice()
+        self.decoder.channels.as_slice()
     }
 }
 
@@ -178,7 +177,7 @@ fn packet(
     is_old: bool,
     big_endian: bool,
     interfaces: &[Interface],
-    channels: &mut ChannelList,
+    decoder: &mut PacketDecoder,
 ) -> Result<Item, String> {
     if content.len() < 20 {
         return Err(format!("packet block with {} bytes, must have at least 20", content.len()));
@@ -196,7 +195,7 @@ fn packet(
     let seconds = i64::try_from(seconds).unwrap_or(i64::MAX).saturating_add(interface.offset_s);
     let nanos = seconds.saturating_mul(1_000_000_000).saturating_add(i64::try_from(nanos).unwrap_or(0));
     let time = Timestamp::from_nanos(nanos);
-    Ok(packet::decode(interface.link, bytes, big_endian, time, channel_of(interface), channels))
+    Ok(decoder.decode(interface.link, bytes, big_endian, time, channel_of(interface)))
 }
 
 /// The channel that the file states for an interface. The cooked header with a number names the channel itself.

@@ -54,71 +54,96 @@ const XL: u8 = 0x80;
 /// Size of the head of a frame, bytes.
 const FRAME_HEAD: usize = 8;
 
-/// Decodes a packet. `channel` is the interface that the file names. `big_endian` is the byte order of the file.
-pub(super) fn decode(
-    link: Option<LinkType>,
-    packet: &[u8],
-    big_endian: bool,
-    time: Timestamp,
-    channel: Option<&Channel>,
-    channels: &mut ChannelList,
-) -> Item {
-    let (cooked, number_at) = match link {
-        None => return Item::Other,
-        Some(LinkType::SocketCan) => (None, None),
-        Some(LinkType::Cooked) => (Some((16, 2, 14)), None),
-        Some(LinkType::CookedTwo) => (Some((20, 8, 0)), Some(4)),
-    };
-    let (mut head, mut protocol) = (0, None);
-    if let Some((len, hardware_at, protocol_at)) = cooked {
-        if packet.len() < len {
-            return Item::Bad(format!("packet of {} bytes, must have a cooked header of {len}", packet.len()));
-        }
-        if u16_at(packet, hardware_at, true) != HARDWARE_CAN {
-            return Item::Other;
-        }
-        (head, protocol) = (len, Some(u16_at(packet, protocol_at, true)));
-    }
-    let is_fd = match protocol {
-        None => false,
-        Some(PROTOCOL_CAN) => false,
-        Some(PROTOCOL_CAN_FD) => true,
-        Some(PROTOCOL_CAN_XL) => return Item::Xl,
-        Some(_) => return Item::Other,
-    };
-    let channel = match channel {
-        Some(channel) => channels.index_of(channel),
-        None => channels.of_label(number_at.map_or(0, |at| u32_at(packet, at, true))),
-    };
-    let Some(channel) = channel else { return Item::Bad("more than 256 channels".to_owned()) };
-    // Without a cooked header, the identifier is big-endian; with it, the identifier has the recorder's byte order.
-    let is_big_endian = protocol.is_none() || big_endian;
-    frame(&packet[head..], is_big_endian, is_fd, time, channel).unwrap_or_else(Item::Bad)
+/// Decodes the packets of a file.
+#[derive(Debug, Default)]
+pub(super) struct PacketDecoder {
+    pub(super) channels: ChannelList,
+    /// Whether the identifiers have the other byte order than the file should have.
+    is_swapped: bool,
 }
 
-fn frame(bytes: &[u8], big_endian: bool, is_fd: bool, time: Timestamp, channel: u8) -> Result<Item, String> {
-    if bytes.len() < FRAME_HEAD {
-        return Err(format!("CAN frame of {} bytes, must have at least {FRAME_HEAD}", bytes.len()));
+impl PacketDecoder {
+    /// Decodes a packet. `channel` is the interface that the file names. `big_endian` is the byte order of the file.
+    pub(super) fn decode(
+        &mut self,
+        link: Option<LinkType>,
+        packet: &[u8],
+        big_endian: bool,
+        time: Timestamp,
+        channel: Option<&Channel>,
+    ) -> Item {
+        let (cooked, number_at) = match link {
+            None => return Item::Other,
+            Some(LinkType::SocketCan) => (None, None),
+            Some(LinkType::Cooked) => (Some((16, 2, 14)), None),
+            Some(LinkType::CookedTwo) => (Some((20, 8, 0)), Some(4)),
+        };
+        let (mut head, mut protocol) = (0, None);
+        if let Some((len, hardware_at, protocol_at)) = cooked {
+            if packet.len() < len {
+                return Item::Bad(format!("packet of {} bytes, must have a cooked header of {len}", packet.len()));
+            }
+            if u16_at(packet, hardware_at, true) != HARDWARE_CAN {
+                return Item::Other;
+            }
+            (head, protocol) = (len, Some(u16_at(packet, protocol_at, true)));
+        }
+        let is_fd = match protocol {
+            None => false,
+            Some(PROTOCOL_CAN) => false,
+            Some(PROTOCOL_CAN_FD) => true,
+            Some(PROTOCOL_CAN_XL) => return Item::Xl,
+            Some(_) => return Item::Other,
+        };
+        let channel = match channel {
+            Some(channel) => self.channels.index_of(channel),
+            None => self.channels.of_label(number_at.map_or(0, |at| u32_at(packet, at, true))),
+        };
+        let Some(channel) = channel else { return Item::Bad("more than 256 channels".to_owned()) };
+        // Without a cooked header, the identifier is big-endian; with it, the identifier has the recorder's byte order.
+        let is_big_endian = protocol.is_none() || big_endian;
+        self.frame(&packet[head..], is_big_endian, is_fd, time, channel).unwrap_or_else(Item::Bad)
     }
-    let (len, flags) = (usize::from(bytes[4]), bytes[5]);
-    // Some recorders use the other byte order. The identifier of an 11-bit frame then looks too large.
-    let orders = [big_endian, !big_endian].map(|order| u32_at(bytes, 0, order));
-    let is_possible = |id: &u32| id & EXTENDED != 0 || id & (ERROR - 1) <= 0x7FF;
-    let id = orders.into_iter().find(is_possible).unwrap_or(orders[0]);
-    // The flags of CAN XL lie where other frames have their length, which is at most 64.
-    if bytes[4] & XL != 0 {
-        return Ok(Item::Xl);
+
+    fn frame(
+        &mut self,
+        bytes: &[u8],
+        big_endian: bool,
+        is_fd: bool,
+        time: Timestamp,
+        channel: u8,
+    ) -> Result<Item, String> {
+        if bytes.len() < FRAME_HEAD {
+            return Err(format!("CAN frame of {} bytes, must have at least {FRAME_HEAD}", bytes.len()));
+        }
+        let (len, flags) = (usize::from(bytes[4]), bytes[5]);
+        // The flags of CAN XL lie where other frames have their length, which is at most 64.
+        if bytes[4] & XL != 0 {
+            return Ok(Item::Xl);
+        }
+        let id = self.identifier(bytes, big_endian);
+        if id & ERROR != 0 {
+            return Ok(Item::ErrorFrame { time, channel, class: id & (ERROR - 1) });
+        }
+        let remote = id & REMOTE != 0;
+        let fd = (is_fd || flags & FD != 0 || len > 8).then_some((flags & BRS != 0, flags & ESI != 0));
+        let data = if remote { &[0; 8][..len.min(8)] } else { bytes.get(FRAME_HEAD..FRAME_HEAD + len).unwrap_or(&[]) };
+        if data.len() < len && !remote {
+            return Err(format!("CAN frame of {len} bytes in a packet with {}", bytes.len() - FRAME_HEAD));
+        }
+        let extended = id & EXTENDED != 0;
+        let frame = RawFrame { id: id & (ERROR - 1), extended, remote, fd: fd.filter(|_| !remote), data }.check()?;
+        Ok(Item::Frame { time, channel, frame })
     }
-    if id & ERROR != 0 {
-        return Ok(Item::ErrorFrame { time, channel, class: id & (ERROR - 1) });
+
+    /// The identifier with its flags. Some recorders write the other byte order; the identifier of an 11-bit frame then
+    /// looks too large.
+    fn identifier(&mut self, bytes: &[u8], big_endian: bool) -> u32 {
+        let read = |is_swapped: bool| u32_at(bytes, 0, big_endian != is_swapped);
+        let is_possible = |id: u32| id & EXTENDED != 0 || id & (ERROR - 1) <= 0x7FF;
+        if !is_possible(read(self.is_swapped)) && is_possible(read(!self.is_swapped)) {
+            self.is_swapped = !self.is_swapped;
+        }
+        read(self.is_swapped)
     }
-    let remote = id & REMOTE != 0;
-    let fd = (is_fd || flags & FD != 0 || len > 8).then_some((flags & BRS != 0, flags & ESI != 0));
-    let data = if remote { &[0; 8][..len.min(8)] } else { bytes.get(FRAME_HEAD..FRAME_HEAD + len).unwrap_or(&[]) };
-    if data.len() < len && !remote {
-        return Err(format!("CAN frame of {len} bytes in a packet with {}", bytes.len() - FRAME_HEAD));
-    }
-    let extended = id & EXTENDED != 0;
-    let frame = RawFrame { id: id & (ERROR - 1), extended, remote, fd: fd.filter(|_| !remote), data }.check()?;
-    Ok(Item::Frame { time, channel, frame })
 }
