@@ -48,12 +48,10 @@ pub fn foreign(head: &[u8]) -> Option<(&'static str, &'static str)> {
     ];
     let first = head.split(|byte| matches!(byte, b'\n' | b'\r')).next().unwrap_or_default().to_ascii_lowercase();
     let first_has = |text: &[u8]| memchr::memmem::find(&first, text).is_some();
-    if first.starts_with(b"time,addr,bus,data") {
-        return Some(("Cabana CSV", VIA_SAVVYCAN));
-    } else if first.starts_with(b"line,abs time") || contains(b"Line,Abs Time(Sec)") {
+    if first.starts_with(b"line,abs time") || contains(b"Line,Abs Time(Sec)") {
         return Some(("Vehicle Spy CSV", VIA_SAVVYCAN));
-    } else if first_has(b"canhacker") || first.starts_with(b"@ text @") {
-        return Some(("CANHacker or CARBUS trace", VIA_SAVVYCAN));
+    } else if contains(b"PP2CAN log file") {
+        return Some(("PP2CAN log", VIA_SAVVYCAN));
     } else if contains(b"Microchip Technology Inc.") {
         return Some(("Microchip CAN BUS Analyzer log", VIA_SAVVYCAN));
     } else if first.starts_with(b"id,data bytes") {

@@ -20,8 +20,8 @@ pub enum Format {
     Asc,
     /// PEAK trace file, version 1.0 to 3.0.
     Trc,
-    /// CSV of SavvyCAN and GVRET devices.
-    Gvret,
+    /// Table with a row per frame, as SavvyCAN, GVRET devices and USB adapters write it.
+    FrameTable,
     /// CSV of python-can.
     PythonCanCsv,
     /// Text log of CSS Electronics CL1000, CL2000 and CL3000.
@@ -59,7 +59,7 @@ impl Format {
         Self::CandumpDeltas,
         Self::Asc,
         Self::Trc,
-        Self::Gvret,
+        Self::FrameTable,
         Self::PythonCanCsv,
         Self::Css,
         Self::Crtd,
@@ -106,7 +106,7 @@ impl Format {
             Self::CandumpDeltas => "candump -td, with its time differences added up",
             Self::Asc => "Vector ASC",
             Self::Trc => "PEAK TRC",
-            Self::Gvret => "SavvyCAN/GVRET CSV",
+            Self::FrameTable => "table of frames, such as SavvyCAN and GVRET CSV",
             Self::PythonCanCsv => "python-can CSV",
             Self::Css => "CSS Electronics text log",
             Self::Crtd => "OVMS CRTD",

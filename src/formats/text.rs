@@ -11,7 +11,7 @@ mod crtd;
 mod css;
 mod cursor;
 pub(crate) mod date;
-mod gvret;
+mod frame_table;
 mod lines;
 mod python_can;
 #[cfg(test)]
@@ -55,12 +55,12 @@ pub(crate) fn recognise(head: &[u8]) -> Option<Format> {
     const FORMATS: [(Format, Recogniser); 8] = [
         (Format::Asc, asc::Asc::recognises),
         (Format::Trc, trc::Trc::recognises),
-        (Format::Gvret, gvret::Gvret::recognises),
         (Format::PythonCanCsv, python_can::PythonCan::recognises),
         (Format::Css, css::Css::recognises),
         (Format::Crtd, crtd::Crtd::recognises),
         (Format::CanKing, canking::CanKing::recognises),
         (Format::Busmaster, busmaster::Busmaster::recognises),
+        (Format::FrameTable, frame_table::FrameTable::recognises),
     ];
     let head = lines::decoded_head(head);
     for line in head.split(|byte| matches!(byte, b'\n' | b'\r')) {
@@ -90,7 +90,7 @@ pub(crate) fn open(format: Format, source: Box<dyn Read>) -> io::Result<Box<dyn 
         Format::CandumpDeltas => TextLog::<candump::CandumpDeltas>::open(source),
         Format::Asc => TextLog::<asc::Asc>::open(source),
         Format::Trc => TextLog::<trc::Trc>::open(source),
-        Format::Gvret => TextLog::<gvret::Gvret>::open(source),
+        Format::FrameTable => TextLog::<frame_table::FrameTable>::open(source),
         Format::PythonCanCsv => TextLog::<python_can::PythonCan>::open(source),
         Format::Css => TextLog::<css::Css>::open(source),
         Format::Crtd => TextLog::<crtd::Crtd>::open(source),

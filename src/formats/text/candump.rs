@@ -22,7 +22,7 @@ const ERROR_FLAG: u32 = 0x2000_0000;
 const ERROR_MASK: u32 = 0x1FFF_FFFF;
 
 const STAMP: &str = "a time in parentheses";
-const IDENTIFIER: &str = "an identifier of 3 or 8 hex digits";
+const IDENTIFIER: &str = "an identifier of at most 8 hex digits";
 const LENGTH: &str = "a length of 0 to 64 in brackets";
 
 /// Text with stamps.
@@ -121,7 +121,7 @@ fn shown(time: Timestamp, channel: u8, mut line: Cursor<'_>) -> Result<Item, Fau
     }
     let at_id = line;
     let word = line.word();
-    let raw = number(word, Base::Hex).filter(|_| matches!(word.len(), 3 | 8));
+    let raw = number(word, Base::Hex).filter(|_| word.len() <= 8);
     let raw = raw.ok_or_else(|| at_id.fault(IDENTIFIER))?;
     let at_len = line;
     let (len, digits) = bracketed(line.word()).ok_or_else(|| at_len.fault(LENGTH))?;
@@ -131,7 +131,7 @@ fn shown(time: Timestamp, channel: u8, mut line: Cursor<'_>) -> Result<Item, Fau
     if word.len() == 8 && raw & ERROR_FLAG != 0 {
         return Ok(Item::ErrorFrame { time, channel, class: raw & ERROR_MASK });
     }
-    let id = identifier(raw, word.len() == 8).ok_or_else(|| at_id.fault(IDENTIFIER))?;
+    let id = identifier(raw, word.len() > 3).ok_or_else(|| at_id.fault(IDENTIFIER))?;
     let is_fd = digits == 2;
     let len = if is_fd { len } else { len.min(8) };
     if line.peek() == b"remote" {
@@ -244,7 +244,7 @@ pub(super) fn is_screen_line(line: &[u8]) -> bool {
         }
     }
     let id = line.word();
-    matches!(id.len(), 3 | 8) && number(id, Base::Hex).is_some() && bracketed(line.word()).is_some()
+    id.len() <= 8 && number(id, Base::Hex).is_some() && bracketed(line.word()).is_some()
 }
 
 /// Whether the stamps of a log are the times since the previous frames (`-td`).
