@@ -5,8 +5,8 @@
 //! always the same columns). The header decides the order of the columns and the separator.
 //!
 //! Times with a decimal point are seconds, times with colons are times of day. Whole numbers have the unit that the header
-//! states; without one, they are microseconds in a column `Time Stamp` and milliseconds in any other. Identifiers and data
-//! bytes are hexadecimal; they are decimal if a data byte in the first 16 KiB has three digits. An identifier above 7FF is
+//! states; without one, they are microseconds in a column `Time Stamp` and milliseconds in any other. If more frames than
+//! any bus carries would lie in the first microseconds, these are milliseconds. Identifiers and data bytes are hexadecimal; they are decimal if a data byte in the first 16 KiB has three digits. An identifier above 7FF is
 //! extended whatever the table says, as in SavvyCAN.
 
 use std::io;
@@ -20,7 +20,13 @@ use crate::Item;
 /// Beginning of a log of CARBUS or CANHacker, and its columns.
 const CARBUS: &[u8] = b"@ TEXT @";
 const CARBUS_COLUMNS: &[u8] = b"time(ms)\tbus\tflags\tid\tlen\tdata";
+/// Power of ten of a microsecond in ns.
+const MICROSECONDS: i32 = 3;
+/// Number of rows from which their times tell the unit.
+const FEWEST_ROWS: usize = 20;
 const DAY_NS: i64 = 86_400_000_000_000;
+/// Smallest mean time between frames: four buses at 1 Mbit/s carry the shortest frames without a pause.
+const SHORTEST_FRAME_NS: i64 = 10_000;
 
 /// Meaning of a column.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -43,6 +49,8 @@ pub(super) struct FrameTable {
     columns: Vec<Column>,
     separator: u8,
     base: Base,
+    /// Power of ten of whole numbers in microseconds, as the first rows show it.
+    whole: i32,
     /// Start of the present day, and the latest time, for times of day.
     day_ns: i64,
     latest_ns: i64,
@@ -50,20 +58,33 @@ pub(super) struct FrameTable {
 
 impl Grammar for FrameTable {
     fn new(head: &[u8]) -> io::Result<Self> {
-        let mut log = Self { columns: Vec::new(), separator: b',', base: Base::Hex, day_ns: 0, latest_ns: 0 };
+        let mut log = Self {
+            columns: Vec::new(),
+            separator: b',',
+            base: Base::Hex,
+            whole: MICROSECONDS,
+            day_ns: 0,
+            latest_ns: 0,
+        };
+        let mut times = Vec::new();
         for line in head.split(|byte| matches!(byte, b'\n' | b'\r')) {
             if log.columns.is_empty() {
                 log.read_header(line);
                 continue;
             }
             let mut line = Cursor::new(line);
-            let bytes = (0..).map_while(|index| Some((log.column(index), line.field(log.separator)?)));
-            if bytes.filter(|(column, _)| *column == Column::Byte).any(|(_, byte)| is_three_digits(byte)) {
-                log.base = Base::Dec;
+            for index in 0.. {
+                let Some(field) = line.field(log.separator) else { break };
+                match log.column(index) {
+                    Column::Byte if is_three_digits(field) => log.base = Base::Dec,
+                    Column::Time(MICROSECONDS) if !field.contains(&b'.') => times.extend(scaled(field, MICROSECONDS)),
+                    _ => {}
+                }
             }
         }
-        log.columns.clear();
-        Ok(log)
+        let span_ns = times.iter().max().zip(times.iter().min()).map_or(0, |(last, first)| last - first);
+        let is_too_fast = times.len() >= FEWEST_ROWS && span_ns < times.len() as i64 * SHORTEST_FRAME_NS;
+        Ok(Self { columns: Vec::new(), whole: if is_too_fast { MICROSECONDS + 3 } else { MICROSECONDS }, ..log })
     }
 
     fn recognises(line: &[u8]) -> bool {
@@ -138,7 +159,9 @@ impl FrameTable {
     /// The time of a row; for a time of day, the time since midnight.
     fn time_ns(&mut self, field: &[u8], power: i32) -> Option<i64> {
         if !field.contains(&b':') {
-            return scaled(field, if field.iter().any(|byte| matches!(byte, b'.' | b',')) { 9 } else { power });
+            let is_whole = !field.iter().any(|byte| matches!(byte, b'.' | b','));
+            let power = if power == MICROSECONDS { self.whole } else { power };
+            return scaled(field, if is_whole { power } else { 9 });
         }
         let mut parts = field.splitn(4, |byte| matches!(byte, b':' | b'.' | b','));
         let mut whole = || number(parts.next()?, Base::Dec).map(i64::from);
@@ -184,9 +207,9 @@ fn column(name: &[u8]) -> Column {
     let (name, unit) = name.split_once(['(', '[']).map_or((name.as_str(), ""), |(name, unit)| (name.trim(), unit));
     match name {
         "time" | "time stamp" | "timestamp" | "time scale" | "abs time" | "system time" => Column::Time(match unit {
-            _ if unit.starts_with("us") || unit.starts_with('µ') => 3,
+            _ if unit.starts_with("us") || unit.starts_with('µ') => MICROSECONDS,
             _ if unit.starts_with('s') => 9,
-            "" if name == "time stamp" => 3,
+            "" if name == "time stamp" => MICROSECONDS,
             _ => 6,
         }),
         "id" | "can id" | "frame id" | "identifier" | "addr" => Column::Id,
