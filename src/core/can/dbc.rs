@@ -398,6 +398,7 @@ fn read_signal<'a>(
         minimum: finite("minimum", number(&signal.min))?,
         maximum: finite("maximum", number(&signal.max))?,
     };
+    let layout = SignalLayout { minimum: lowest(&layout), ..layout };
     Ok(Signal {
         name: signal.name.clone(),
         layout,
@@ -411,6 +412,14 @@ fn read_signal<'a>(
         values: own.values.iter().map(|value| (value.id, value.description.clone())).collect(),
         comment: own.comment.map(str::to_owned),
     })
+}
+
+/// The minimum of a signal. Some files state the size of both ends instead: "[0|819.2]" of a signal with the offset -819.2
+/// means -819.2 to 819.2.
+fn lowest(layout: &SignalLayout) -> f64 {
+    let is_size = layout.minimum == 0.0 && layout.offset < 0.0 && layout.maximum > 0.0;
+    let is_symmetrical = (layout.offset + layout.maximum).abs() <= 0.01 * layout.maximum;
+    if is_size && is_symmetrical { layout.offset } else { layout.minimum }
 }
 
 fn number(value: &can_dbc::NumericValue) -> f64 {

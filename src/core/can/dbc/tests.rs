@@ -79,6 +79,19 @@ SG_MUL_VAL_ 1 Deep Inner 0-3, 7-9;
 }
 
 #[test]
+fn range_from_zero_to_negative_offset_has_both_signs() {
+    for (numbers, minimum) in [
+        ("(0.1,-819.2) [0|819.2]", -819.2),
+        ("(0.1,-819.2) [0|800]", 0.0),
+        ("(1,-40) [0|215]", 0.0),
+        ("(0.1,0) [0|819.2]", 0.0),
+    ] {
+        let db = parse(&format!("BO_ 1 A: 8 X\n SG_ S : 0|16@1+ {numbers} \"\" X\n")).unwrap();
+        assert_eq!(db.signal("A.S").unwrap().1.layout.minimum, minimum, "{numbers}");
+    }
+}
+
+#[test]
 fn errors_state_their_line() {
     let line_and_text = |body: &str| {
         let error = parse(body).map_or_else(|error| error, |mut db| db.left_out.swap_remove(0));
