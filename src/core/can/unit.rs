@@ -59,7 +59,8 @@ impl SignalUnit {
 fn other_quantity(plain: &str) -> Option<&'static str> {
     Some(match plain {
         "deg" | "degree" | "degrees" | "rad" => "an angle",
-        "%" | "percent" | "pct" => "a percentage",
+        // Some files add a remark, such as "%+1".
+        _ if plain.starts_with('%') || matches!(plain, "percent" | "pct") => "a percentage",
         "ah" | "mah" => "a charge",
         "w" | "kw" => "a power",
         "wh" | "kwh" => "an energy",
@@ -88,6 +89,7 @@ mod tests {
         for celsius in ["C", "degC", "deg C", "\u{b0}C", "Celsius"] {
             assert_eq!(known(celsius), Some((Quantity::Temperature, 1.0, 0.0)), "{celsius}");
         }
+        assert_eq!(known("%+1"), Some((Quantity::PERCENTAGE, 1.0, 0.0)));
         assert_eq!(known("mV"), Some((Quantity::Voltage, 1e-3, 0.0)));
         assert_eq!(known("K"), Some((Quantity::Temperature, 1.0, -273.15)));
         for angle in ["Deg", "\u{b0}", "rad"] {

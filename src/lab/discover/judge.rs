@@ -78,7 +78,7 @@ pub(super) fn candidates(signals: &[LogSignal], interfaces: &[String], label: &P
     let mut cells: Vec<Evidence> = groups.iter().filter_map(|group| cell_group(group, signals)).collect();
     let grouped: std::collections::BTreeSet<usize> = cells.iter().flat_map(|group| group.members.clone()).collect();
     let alone = usable.iter().filter(|index| !grouped.contains(index));
-    cells.extend(alone.filter_map(|index| single_cell(*index, &signals[*index])));
+    cells.extend(alone.filter_map(|index| single_cell(*index, &signals[*index], label)));
     compare_sums(&mut voltages, &mut cells, signals);
     sort(&mut cells);
     compare_currents(&mut voltages, &mut cells, &mut currents, signals);
@@ -236,11 +236,11 @@ fn current(index: usize, signal: &LogSignal) -> Option<Evidence> {
     Some(evidence)
 }
 
-/// Plausible voltages of one cell (V).
+/// Plausible voltages of one cell in a group (V), also of a failing one.
 const CELL_V: (f64, f64) = (1.5, 4.5);
 
-fn single_cell(index: usize, signal: &LogSignal) -> Option<Evidence> {
-    let mut evidence = Evidence::new(index, signal, PackQuantity::CellVoltage, CELL_V)?;
+fn single_cell(index: usize, signal: &LogSignal, label: &PackLabel) -> Option<Evidence> {
+    let mut evidence = Evidence::new(index, signal, PackQuantity::CellVoltage, label.cell_v())?;
     evidence.add(1.0, signal.label.says_extreme(), "an extreme of the cells, not a single cell");
     Some(evidence)
 }
@@ -392,7 +392,9 @@ fn compare_currents(
     for current in currents.iter_mut().take(40) {
         let related = |voltage: &Evidence| response(&signals[voltage.members[0]], &signals[current.members[0]]);
         let compared = voltages.iter_mut().take(40).chain(cells.iter_mut().take(5));
-        let compared = compared.filter(|voltage| !has_known || is_known(voltage));
+        // A limit of the voltage is a calculated value and does not show the sign.
+        let is_limit = |voltage: &Evidence| voltage.low > 60.0 && signals[voltage.members[0]].label.says_extreme();
+        let compared = compared.filter(|voltage| !is_limit(voltage) && (!has_known || is_known(voltage)));
         let found = compared.filter_map(|voltage| Some((related(voltage)?, voltage)));
         // Prefer a voltage with more evidence.
         let weight = |slope: Slope, voltage: &Evidence| slope.correlation().abs() + 0.05 * voltage.score.points;

@@ -80,6 +80,10 @@ fn of_message(key: MessageKey, payloads: &Payloads, file: usize, message: &Messa
         let mut binding = Binding::new(key.0, message, signal, Channel::Current).ok()?;
         (binding.scale, binding.offset) = conversion(&signal.unit);
         let label = SignalLabel::new(&message.name, &signal.name, &signal.unit);
+        // A percentage never reaches 1000: such a signal counts tenths.
+        if (label.says_soc() || label.says_soh()) && signal.layout.maximum == 1000.0 {
+            binding.scale = 0.1;
+        }
         let values = |binding: &Binding| {
             let present = payloads.iter().filter(|(_, payload)| binding.holds(payload) == Ok(true));
             Series::of(present.map(|(time_s, payload)| (time_s, recorded_value(payload, binding))))

@@ -76,7 +76,7 @@ const ELECTRONICS: &str =
 const LOW_VOLTAGE: &str = "12v twelvevolt twelve_volt =lv aux starter";
 /// Words that indicate a value that is not measured, such as a limit or request.
 const NO_MEASUREMENT: &str = "limit target request =req avail possible set allowed threshold lifetime cumulative rated nominal =id \
-    =num count delta =dev deviation fault offset reserve initial";
+    =num count delta =dev deviation fault offset reserve initial =hist history";
 
 impl Score {
     /// If `holds` is true, adds `points`, and adds `reason` unless it is empty.
