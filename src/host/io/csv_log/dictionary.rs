@@ -247,6 +247,12 @@ const NAMES: [(Role, &[&str]); 19] = [
             "command",
             "work mode",
             "direction",
+            "charging",
+            "charging status",
+            "charge discharge",
+            "battery status",
+            "battery state",
+            "bms state",
         ],
     ),
     (Role::Discharged, &["discharged"]),
@@ -303,12 +309,25 @@ impl Role {
 
 /// The roles that a column may have.
 pub(super) fn known(name: &str, unit: &str) -> Vec<Known> {
+    if !unit.is_empty() && unknown_unit(name, unit).is_some() {
+        return Vec::new();
+    }
     let name = ColumnName::parse(name, unit);
     let found = lookup(&name);
     if !found.is_empty() {
         return found;
     }
     name.with_last_word_as_unit().map_or_else(Vec::new, |name| lookup(&name))
+}
+
+/// The role and the unit of a column whose unit is unknown: in the line of units, in brackets or after a slash.
+pub(super) fn unknown_unit(name: &str, unit: &str) -> Option<(Role, String)> {
+    let trimmed = |text: &str| text.trim_matches(['(', '[', '{', ')', ']', '}', ' ']).to_owned();
+    let (words, text) = if trimmed(unit).is_empty() { name.rsplit_once(['(', '[', '{', '/'])? } else { (name, unit) };
+    let text = trimmed(text);
+    let role = lookup(&ColumnName::parse(words, "")).first()?.role;
+    let is_unknown = !text.is_empty() && text.chars().all(char::is_alphabetic) && Unit::find(&text).is_none();
+    (is_unknown && role != Role::Date && role.quantity().is_some()).then_some((role, text))
 }
 
 fn lookup(name: &ColumnName) -> Vec<Known> {
@@ -331,8 +350,8 @@ fn lookup(name: &ColumnName) -> Vec<Known> {
             Role::Current | Role::Voltage if BATTERY.contains(&name.words.as_str()) => {
                 name.number.is_none() && unit.is_some()
             }
-            Role::Temperature => name.words != "t" || name.number.is_some() || unit.is_some(),
             Role::Time if name.words == "test" => unit.is_some() || name.is_clock,
+            Role::Temperature => true,
             _ => name.number.is_none(),
         };
         quantity_fits && number_fits && (!name.is_clock || role.quantity() == Some(Quantity::Time))
