@@ -77,6 +77,7 @@ pub struct CsvLog {
     table: Table,
     time_column: usize,
     time: TimeText,
+    last_time: Option<Timestamp>,
     /// The column of each used channel.
     channels: Vec<(Channel, Column)>,
     sign: CurrentSign,
@@ -158,6 +159,7 @@ impl CsvLog {
         Ok(Self {
             time_column: layout.time.index,
             time,
+            last_time: None,
             values: Vec::with_capacity(layout.channels.len()),
             channels: layout.channels,
             sign,
@@ -200,13 +202,23 @@ impl CsvLog {
     /// # Errors
     /// Fails if the source fails.
     pub fn next_row(&mut self) -> Result<Option<Result<RowTime, TableError>>, TableError> {
-        let Some(row) = self.table.next_row()? else { return Ok(None) };
+        let Some((row, after)) = self.table.next_rows()? else { return Ok(None) };
         self.values.clear();
         self.reading.rows += 1;
-        let time = self.time.parse(row.bytes(self.time_column).unwrap_or_default());
-        let Some(time) = time.filter(|time| probable_stamp_unit(time.secs()).is_none()) else {
+        let is_possible = |time: &Timestamp| probable_stamp_unit(time.secs()).is_none();
+        let Some(time) = self.time.parse(row.bytes(self.time_column).unwrap_or_default()).filter(is_possible) else {
             return Ok(Some(Err(row.fault(self.time_column, "a time before the year 2100"))));
         };
+        let before = self.last_time.filter(|_| self.sections.is_none());
+        if let (Some(before), Some(after)) =
+            (before, after.and_then(|row| self.time.clone().parse(row.bytes(self.time_column).unwrap_or_default())))
+            && before <= after
+            && !(before..=after).contains(&time)
+            && is_possible(&after)
+        {
+            return Ok(Some(Err(row.fault(self.time_column, "between the times of the rows around it"))));
+        }
+        self.last_time = Some(time);
         for &(channel, column) in &self.channels {
             let Some(value) = row.parsed(column.index) else {
                 return Ok(Some(Err(row.fault(column.index, NUMBER))));

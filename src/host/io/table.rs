@@ -67,6 +67,9 @@ const MAX_LISTED_COLUMNS: usize = 64;
 pub struct Table {
     rows: Rows,
     record: csv::ByteRecord,
+    next: csv::ByteRecord,
+    /// Line of `next`, or why it could not be read; `None` = `next` is not read yet.
+    ahead: Option<Result<Option<u64>, TableError>>,
     header: Header,
 }
 
@@ -190,9 +193,14 @@ impl Table {
         let open = |source: Box<dyn Read>| {
             let (source, since_row) = RowLimit::new(source);
             let rows = Rows::Text { reader: builder.from_reader(source), since_row, lines_before, rejoined };
-            Self { rows, record: csv::ByteRecord::new(), header: header.clone() }
+            Self::of(rows, header.clone())
         };
         Ok((open(Box::new(Cursor::new(data).chain(head.rest))), open(preview)))
+    }
+
+    fn of(rows: Rows, header: Header) -> Self {
+        let [record, next] = [csv::ByteRecord::new(), csv::ByteRecord::new()];
+        Self { rows, record, next, ahead: None, header }
     }
 
     /// Opens a Parquet file, and the same file again for a look at its first rows.
@@ -206,7 +214,7 @@ impl Table {
             let names = names.iter().map(|name| escaped(name)).collect();
             let file = path.display().to_string();
             let header = Header { file, line: 1, names, units: Vec::new(), has_decimal_comma: false };
-            Ok(Self { rows: Rows::Parquet(rows), record: csv::ByteRecord::new(), header })
+            Ok(Self::of(Rows::Parquet(rows), header))
         };
         Ok((open()?, open()?))
     }
@@ -230,24 +238,43 @@ impl Table {
     /// # Errors
     /// Fails if the source fails, for example because a compressed file is damaged.
     pub fn next_row(&mut self) -> Result<Option<Row<'_>>, TableError> {
+        let Some(line) = self.ahead.take().unwrap_or_else(|| self.read())? else { return Ok(None) };
+        std::mem::swap(&mut self.record, &mut self.next);
+        Ok(Some(Row { line, record: &self.record, header: &self.header }))
+    }
+
+    /// The next row, and the row after it, if it can be read.
+    ///
+    /// # Errors
+    /// Fails like [`next_row`](Self::next_row).
+    pub(super) fn next_rows(&mut self) -> Result<Option<(Row<'_>, Option<Row<'_>>)>, TableError> {
+        let Some(line) = self.next_row()?.map(|row| row.line) else { return Ok(None) };
+        self.ahead = Some(self.read());
+        let row = |line, record| Row { line, record, header: &self.header };
+        let after = matches!(self.ahead, Some(Ok(Some(_)))).then(|| row(line + 1, &self.next));
+        Ok(Some((row(line, &self.record), after)))
+    }
+
+    /// Reads a row into `next`. Returns its line.
+    fn read(&mut self) -> Result<Option<u64>, TableError> {
         let (more, line) = match &mut self.rows {
             Rows::Text { reader, since_row, lines_before, rejoined } => {
                 since_row.set(0);
-                let more = reader.read_byte_record(&mut self.record).map_err(|e| damaged(&self.header.file, &e))?;
-                let line = *lines_before + self.record.position().map_or(0, csv::Position::line);
-                rejoined.iter().for_each(|&separator| join_quoted(&mut self.record, separator));
+                let more = reader.read_byte_record(&mut self.next).map_err(|e| damaged(&self.header.file, &e))?;
+                let line = *lines_before + self.next.position().map_or(0, csv::Position::line);
+                rejoined.iter().for_each(|&separator| join_quoted(&mut self.next, separator));
                 (more, line)
             }
             #[cfg(feature = "formats")]
             Rows::Parquet(rows) => {
-                let more = rows.next(&mut self.record);
+                let more = rows.next(&mut self.next);
                 (
                     more.map_err(|what| TableError::Data(format!("{}: damaged: {what}", self.header.file)))?,
                     rows.number(),
                 )
             }
         };
-        Ok(more.then_some(Row { line, record: &self.record, header: &self.header }))
+        Ok(more.then_some(line))
     }
 }
 
