@@ -62,13 +62,13 @@ pub(crate) struct Known {
     /// What the pack's label says, every part optional: chemistry, capacity, cells in series, such as nmc:64Ah:98s. Decides
     /// scales of undescribed fields; in a configuration, also describes the cell if --model is not given
     #[arg(long, value_name = "LABEL")]
-    label: Option<PackLabel>,
+    pub(crate) label: Option<PackLabel>,
     /// Cell model for the configuration
     #[arg(long, value_name = "CELL.toml")]
     pub(crate) model: Option<PathBuf>,
     /// Meaning of a positive current; needed if the log does not show it
     #[arg(long, value_enum)]
-    positive: Option<Positive>,
+    pub(crate) positive: Option<Positive>,
 }
 
 /// Sign of the current.

@@ -196,7 +196,7 @@ pub fn check_charge(time_s: &[f64], current_a: &[f64], capacity_ah: f64) -> Resu
     if span_ah <= MAX_CAPACITIES * capacity_ah {
         return Ok(());
     }
-    let what = format!("the current moves {span_ah:.0} Ah, but the capacity is {capacity_ah} Ah");
+    let what = format!("the current moves {span_ah:.0} Ah one way, but the rated capacity is {capacity_ah} Ah");
     implausible("time", Some(probable_step_unit(median_step(time_s).unwrap_or_default())), what)
 }
 
@@ -279,12 +279,18 @@ pub fn shown_sign(time_s: &[f64], current_a: &[f64], cell_voltage_v: &[f64]) -> 
     if discharge > charge { ShownSign::Discharge } else { ShownSign::Charge }
 }
 
-/// Changes of current and voltage from row to row. Rows after a gap do not count: the recorder may have missed a charge.
+/// Changes of current and voltage from row to row, of the rows that have both. Rows after a gap do not count: the recorder
+/// may have missed a charge.
 fn steps(time_s: &[f64], current_a: &[f64], voltage_v: &[f64]) -> Vec<(f64, f64)> {
-    let longest_s = longest_step(time_s);
-    let pairs = time_s.windows(2).zip(current_a.windows(2).zip(voltage_v.windows(2)));
-    let near = pairs.filter(|(time_s, _)| (0.0..=longest_s).contains(&(time_s[1] - time_s[0])));
-    near.map(|(_, (i, v))| (i[1] - i[0], v[1] - v[0])).filter(|(i, v)| i.is_finite() && v.is_finite()).collect()
+    let rows = time_s
+        .iter()
+        .zip(current_a)
+        .zip(voltage_v)
+        .map(|((time_s, current_a), voltage_v)| [*time_s, *current_a, *voltage_v]);
+    let rows: Vec<[f64; 3]> = rows.filter(|row| row.iter().all(|value| value.is_finite())).collect();
+    let longest_s = longest_step(&rows.iter().map(|row| row[0]).collect::<Vec<_>>());
+    let near = rows.windows(2).filter(|pair| (0.0..=longest_s).contains(&(pair[1][0] - pair[0][0])));
+    near.map(|pair| (pair[1][1] - pair[0][1], pair[1][2] - pair[0][2])).collect()
 }
 
 /// For each stretch of constant current: whether a positive current discharges. The voltage falls at a discharge and

@@ -81,7 +81,7 @@ const UNITS: [Unit; 22] = [
     unit(Quantity::Voltage, "V", 1.0, 1.0, &["v", "volt", "volts"]),
     unit(Quantity::Voltage, "mV", 1.0, 1e3, &["mv", "millivolt", "millivolts"]),
     unit(Quantity::Voltage, "uV", 1.0, 1e6, &["uv", "microvolt"]),
-    unit(Quantity::Temperature, "degC", 1.0, 1.0, &["c", "degc", "celsius", "deg_c", "degreec", "degreesc"]),
+    unit(Quantity::Temperature, "degC", 1.0, 1.0, &["c", "oc", "degc", "celsius", "deg_c", "degreec", "degreesc"]),
     Unit {
         quantity: Quantity::Temperature,
         symbol: "K",

@@ -65,6 +65,10 @@ const NAMES: [(Role, &[&str]); 19] = [
             "millis",
             "milliseconds",
             "test duration",
+            "ms today",
+            "zeit",
+            "gesamtzeit",
+            "programmdauer",
         ],
     ),
     (
@@ -89,6 +93,8 @@ const NAMES: [(Role, &[&str]); 19] = [
             "gps time",
             "date and time",
             "recorded at",
+            "zeitstempel",
+            "\u{7edd}\u{5bf9}\u{65f6}\u{95f4}",
             "gmtime",
         ],
     ),
@@ -114,6 +120,10 @@ const NAMES: [(Role, &[&str]); 19] = [
             "mamps",
             "hv battery current",
             "bms current",
+            "bms battery current",
+            "current in",
+            "strom",
+            "\u{7535}\u{6d41}",
             "battery amps",
             "battery",
             "batt",
@@ -136,6 +146,8 @@ const NAMES: [(Role, &[&str]); 19] = [
             "potential",
             "terminal voltage",
             "vol",
+            "spannung",
+            "\u{7535}\u{538b}",
         ],
     ),
     (
@@ -149,6 +161,9 @@ const NAMES: [(Role, &[&str]); 19] = [
             "total voltage",
             "hv battery voltage",
             "bms voltage",
+            "bms battery voltage",
+            "input voltage",
+            "pack inst voltage",
             "battery volts",
             "ewe",
             "battery terminal voltage",
@@ -206,6 +221,9 @@ const NAMES: [(Role, &[&str]); 19] = [
             "volume averaged cell temperature",
             "temperature measured",
             "cell t",
+            "cell temp mid",
+            "temperatur",
+            "\u{6e29}\u{5ea6}",
         ],
     ),
     (
@@ -215,6 +233,9 @@ const NAMES: [(Role, &[&str]); 19] = [
             "battery temp",
             "batt temp",
             "bat temp",
+            "hv battery temperature",
+            "hv battery temp",
+            "bms battery temperature",
             "pack temperature",
             "pack temp",
             "pack t",
@@ -253,6 +274,8 @@ const NAMES: [(Role, &[&str]); 19] = [
             "battery status",
             "battery state",
             "bms state",
+            "zustand",
+            "\u{5de5}\u{6b65}\u{7c7b}\u{578b}",
         ],
     ),
     (Role::Discharged, &["discharged"]),
@@ -267,7 +290,8 @@ const NAMES: [(Role, &[&str]); 19] = [
 const BATTERY: [&str; 4] = ["battery", "batt", "bat", "pack"];
 
 /// Names that contain their unit as a word.
-const UNITS_AS_NAMES: [(&str, &str); 11] = [
+const UNITS_AS_NAMES: [(&str, &str); 12] = [
+    ("ms today", "ms"),
     ("seconds", "s"),
     ("minutes", "min"),
     ("hours", "h"),
@@ -334,7 +358,7 @@ fn lookup(name: &ColumnName) -> Vec<Known> {
     let as_word = || {
         UNITS_AS_NAMES
             .iter()
-            .find(|(word, _)| name.words.rsplit(' ').next() == Some(*word))
+            .find(|(word, _)| name.words == *word || name.words.rsplit(' ').next() == Some(*word))
             .and_then(|of| Unit::find(of.1))
     };
     let unit = name.unit.or_else(as_word);

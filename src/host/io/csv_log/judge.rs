@@ -437,6 +437,9 @@ impl Judge<'_> {
         let codes = if is_never_negative { self.codes(layout, times) } else { Vec::new() };
         if is_never_negative && discharges + charges + codes.len() > 0 {
             let noise_a = 0.01 * largest;
+            self.notes.extend(codes.iter().map(|(code, direction)| {
+                format!("state {} is a {direction:?} by the voltage", String::from_utf8_lossy(code)).to_lowercase()
+            }));
             let has_positive = [charges > 0 || !codes.is_empty(), discharges > 0 || !codes.is_empty()];
             let by_state = CurrentSign::new(true, SignSource::State);
             return Ok(CurrentSign { is_by_state: true, has_positive, noise_a, codes, ..by_state });
@@ -451,7 +454,7 @@ impl Judge<'_> {
                  state=NAME, or give --csv-sign"
             )));
         }
-        if is_never_negative && largest > 0.0 {
+        if is_never_negative && largest > 0.0 && layout.format.charge_positive().is_none() {
             self.notes.push("the current is never negative in the first rows".to_owned());
         }
         let by_state = (charges + count(Direction::Discharge, false), discharges + count(Direction::Charge, false));

@@ -22,6 +22,9 @@ pub struct TableReading {
     pub read: u64,
     /// Currents that were refused because they are impossible.
     pub refused_currents: u64,
+    /// Whether a column of temperatures is read.
+    #[serde(skip)]
+    pub has_temperature: bool,
     /// The largest possible current (A), for the message.
     #[serde(skip)]
     largest_current: String,
@@ -51,6 +54,7 @@ impl TableReading {
             rows: 0,
             read: 0,
             refused_currents: 0,
+            has_temperature: layout.channels.iter().any(|(channel, _)| matches!(channel, Channel::Temperature(_))),
             largest_current: super::PackSize { capacity_ah: options.capacity_ah }.max_current_a().to_string(),
         }
     }

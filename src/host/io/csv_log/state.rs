@@ -51,8 +51,8 @@ pub(super) fn direction(state: &[u8]) -> Option<Direction> {
     let is_divided = words.windows(2).any(|pair| ["d", "dis", "de"].contains(&&*pair[0]) && pair[1].starts_with("ch"));
     match () {
         () if is(NEGATION) => None,
-        () if is("d dis") || is_divided || has(DISCHARGE) => Some(Direction::Discharge),
-        () if is("c ch cha") || has(CHARGE) => Some(Direction::Charge),
+        () if is("d dis ent") || is_divided || has(DISCHARGE) => Some(Direction::Discharge),
+        () if is("c ch cha lad") || has(CHARGE) => Some(Direction::Charge),
         () => None,
     }
 }
