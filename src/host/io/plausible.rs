@@ -171,7 +171,8 @@ pub fn check_response(
     check_charge(time_s, current_a, capacity_ah)
 }
 
-/// Checks that the charge stays within a few capacities. Gaps count as one long step. Currents below a twentieth of the
+/// Checks that the charge stays within a few capacities. After a gap, in which a charge may be missing, it counts anew.
+/// Currents below a twentieth of the
 /// capacity per hour do not count: the offset of a sensor adds up over months.
 ///
 /// # Errors
@@ -182,12 +183,12 @@ pub fn check_charge(time_s: &[f64], current_a: &[f64], capacity_ah: f64) -> Resu
     for sign in [1.0, -1.0] {
         let (mut charge_ah, mut low_ah, mut high_ah) = (0.0_f64, 0.0_f64, 0.0_f64);
         for (pair, current_a) in time_s.windows(2).zip(current_a) {
-            if current_a.abs() < 0.05 * capacity_ah || !(pair[1] > pair[0]) || !current_a.is_finite() {
-                continue;
+            let step_s = pair[1] - pair[0];
+            if current_a.abs() >= 0.05 * capacity_ah && (0.0..=longest_s).contains(&step_s) {
+                charge_ah += sign * current_a * step_s / 3600.0;
             }
-            charge_ah += sign * current_a * (pair[1] - pair[0]).min(longest_s) / 3600.0;
             high_ah = high_ah.max(charge_ah);
-            if charge_ah < low_ah || charge_ah < high_ah - 0.5 * capacity_ah {
+            if step_s > longest_s || charge_ah < low_ah || charge_ah < high_ah - 0.5 * capacity_ah {
                 (low_ah, high_ah) = (charge_ah, charge_ah);
             }
             span_ah = span_ah.max(high_ah - low_ah);
@@ -226,7 +227,7 @@ pub fn check_slope(
         {
             charge_ah += (pair[1].0 - pair[0].0) * (pair[0].1 + pair[1].1).abs() / 2.0 / 3600.0;
             let (change_v, capacities) = (pair[1].2 - first.2, charge_ah / capacity_ah);
-            if first.1.abs() > 0.7 * largest && change_v.abs() > 0.05 && change_v.abs() > MAX_SLOPE_V * capacities {
+            if first.1.abs() > 0.7 * largest && change_v.abs() > 0.2 && change_v.abs() > MAX_SLOPE_V * capacities {
                 let what = format!(
                     "moves {:.2} % of the capacity while the voltage changes by {change_v:.2} V",
                     100.0 * capacities
@@ -383,6 +384,21 @@ mod tests {
             let stamps: Vec<f64> = time.iter().map(|time| (1.7e9 + time) * factor).collect();
             assert_eq!(found(check(&stamps, &current, &voltage)), Some(("time", Some(unit))));
         }
+    }
+
+    #[test]
+    fn gaps_and_offsets_do_not_count_as_charge() {
+        let check = |time_s: &[f64], current_a: &[f64]| check_charge(time_s, current_a, 3.0).is_ok();
+        let minutes: Vec<f64> = (0..40_000).map(|n| 60.0 * f64::from(n)).collect();
+        let cycles: Vec<f64> = (0..40_000).map(|n| if n / 100 % 2 == 0 { 1.5 } else { -1.47 }).collect();
+        assert!(check(&minutes, &vec![0.1; 40_000]) && check(&minutes, &cycles));
+        assert!(check(&[0.0, 60.0, 120.0, 360_000.0, 360_060.0], &[3.0; 5]) && !check(&minutes, &vec![1.0; 40_000]));
+        // A discharge in an hour, stated in minutes but read as seconds.
+        let (time, current) = ((0..60).map(f64::from).collect::<Vec<_>>(), [3.0; 60]);
+        let voltage: Vec<f64> = time.iter().map(|time| 4.1 - time / 60.0).collect();
+        let slope =
+            |factor: f64| check_slope(&scaled(&time, factor), &current, &voltage, 3.0).err().and_then(|of| of.probable);
+        assert_eq!((slope(1.0), slope(60.0)), (Some("min"), None));
     }
 
     #[test]

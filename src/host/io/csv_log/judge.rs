@@ -309,9 +309,10 @@ impl Judge<'_> {
         if let Some(symbol) = by_charge {
             return (find(symbol), false);
         }
-        // Rows are rarely ten minutes apart.
+        // Rows are rarely ten minutes or less than 5 ms apart.
         let usual = if step >= 500.0 { ["ms", "us", "ns", "s"] } else { ["s", "ms", "min", "h"] };
-        let mut candidates = grid_unit(raw).into_iter().chain(usual);
+        let is_usual = |symbol: &&str| find(symbol).convert(step) >= 0.005 || step <= 0.0;
+        let mut candidates = grid_unit(raw).into_iter().chain(usual.into_iter().filter(is_usual)).chain(["s"]);
         let unit = candidates.find(|symbol| self.is_possible_time_unit(raw, find(symbol)));
         (unit.map_or(layout.time.unit, find), true)
     }
