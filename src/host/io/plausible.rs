@@ -93,8 +93,14 @@ pub fn check_dates(time_s: &[f64]) -> Result<(), Implausible> {
 /// Checks the order of the times of rows (s).
 ///
 /// # Errors
-/// More than a fifth of the times are before the time of the previous row.
+/// More than a fifth of the times are before the time of the previous row, or ten rows or more advance by less than 1 us
+/// each.
 pub fn check_order(time_s: &[f64]) -> Result<(), Implausible> {
+    let known = || time_s.iter().copied().filter(|time_s| time_s.is_finite());
+    let span_s = known().fold(f64::MIN, f64::max) - known().fold(f64::MAX, f64::min);
+    if time_s.len() >= 10 && (0.0..1e-6 * time_s.len() as f64).contains(&span_s) {
+        return implausible("time", None, "advances by less than 1 us per row".to_owned());
+    }
     let back = time_s.windows(2).filter(|pair| pair[1] < pair[0]).count();
     if back * 5 <= time_s.len() {
         return Ok(());

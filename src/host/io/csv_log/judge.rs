@@ -256,17 +256,6 @@ impl Judge<'_> {
         if layout.section.is_none() {
             plausible::check_order(&times).map_err(|of| self.fault(layout, &of))?;
         }
-        let steps = times.windows(2).filter(|pair| pair[1] != pair[0]).count();
-        if layout.section.is_none()
-            && times.len() >= 10
-            && (steps == 0
-                || median(&times).is_some_and(|t| {
-                    (times[times.len() - 1] - times[0]).abs() < 1e-6 * times.len() as f64 + f64::EPSILON * t.abs()
-                }))
-        {
-            let what = "advances by less than 1 us per row".to_owned();
-            return Err(self.fault(layout, &Implausible { quantity: "time", what, probable: None }));
-        }
         if form == TimeForm::Number && layout.time.is_stated && unit.per_base() == 1.0 {
             self.note_other_unit(layout, &times);
         }

@@ -371,8 +371,7 @@ fn is_readable(first: &FirstRows, index: usize, known: &Known) -> bool {
                 parse_field(text.as_bytes()).flatten().or_else(|| Some(reader.parse(text.as_bytes())?.secs()))
             };
             let times: Vec<f64> = texts.iter().map(|text| text.trim()).filter_map(number).collect();
-            let advances = times.len() < 2 || times.iter().any(|time| *time != times[0]);
-            is_half(times.len(), texts.len()) && advances && plausible::check_order(&times).is_ok()
+            is_half(times.len(), texts.len()) && plausible::check_order(&times).is_ok()
         }
         Role::State => rows().any(|row| row.bytes(index).and_then(direction).is_some()),
         Role::Step | Role::StepTime | Role::CellVoltage => true,
