@@ -141,9 +141,7 @@ pub(crate) fn search(logs: &[PathBuf], known: &Known, channels: Vec<(String, Str
         let names = names.join(", ");
         return Err(Failure::new(match counts.tables.is_empty() {
             true => format!("{names}: no CAN frames; give a journal or a CAN log"),
-            false => format!(
-                "{names}: a table has no CAN frames; `packwatch report -c PACK.toml` and `packwatch score` read tables"
-            ),
+            false => format!("{names}: a table has no CAN frames; `packwatch look`, `report` and `score` read tables"),
         }));
     }
     Ok(Search { discoverer, discovery, counts, interfaces })

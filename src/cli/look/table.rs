@@ -27,8 +27,10 @@ impl PackTable {
             let size = CsvOptions { capacity_ah: label.capacity_ah, ..size };
             Ok(tables(args, size)?.map(|reading| Self { reading, label, cells, is_total }))
         };
+        let hint = "; if it is a pack, say how many cells are in series, such as --label nmc:64Ah:98s";
         let failed = |error: LogError| {
-            Failure::new(format!("{error}\nIf it is a pack, say the cells in series, such as --label nmc:64Ah:98s"))
+            let is_of_voltage = label.cells.is_none() && error.to_string().contains("voltage");
+            Failure::new(format!("{error}{}", if is_of_voltage { hint } else { "" }))
         };
         match read(false) {
             Err(of_cells) if cells > 1 => {
