@@ -226,7 +226,7 @@ impl CsvLog {
             let value = value.map(|value| column.unit.convert(value));
             let value = match (channel, value) {
                 (Channel::Current, Some(current_a)) => {
-                    let state = self.state.filter(|_| self.sign.is_by_state);
+                    let state = self.state.filter(|_| self.sign.noise_a > 0.0);
                     if let Some(fault) = state.and_then(|state| unknown_state(&self.sign, &row, state, current_a)) {
                         return Ok(Some(Err(fault)));
                     }
@@ -262,7 +262,8 @@ const NUMBER: &str = "a finite number or an empty field";
 /// The fault of a row whose current is a magnitude and whose state is unknown.
 fn unknown_state(sign: &CurrentSign, row: &Row<'_>, state: usize, current_a: f64) -> Option<TableError> {
     let text = row.bytes(state).unwrap_or_default();
-    let is_known = current_a.abs() <= sign.noise_a || sign.direction(text).is_some() || is_rest(text);
+    let is_known =
+        !sign.is_by_state || current_a.abs() <= sign.noise_a || sign.direction(text).is_some() || is_rest(text);
     (!is_known).then(|| row.fault(state, "charge, discharge or rest, because the current has no sign"))
 }
 

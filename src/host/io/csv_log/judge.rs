@@ -236,7 +236,9 @@ impl Judge<'_> {
 
     /// Finds form and unit of the times. Returns the times of the rows (s), too.
     fn times(&mut self, layout: &Layout) -> Result<(TimeText, TimeForm, bool, Vec<f64>), TableError> {
-        let form = self.samples.time_texts.first().map_or(TimeForm::Number, |text| TimeText::form(text));
+        let texts = &self.samples.time_texts;
+        let first = texts.iter().find(|text| text.contains(|c: char| c.is_ascii_digit()));
+        let form = first.map_or(TimeForm::Number, |text| TimeText::form(text));
         let (mut unit, mut is_assumed) = (layout.time.unit, false);
         if form == TimeForm::Number && !layout.time.is_stated {
             (unit, is_assumed) = self.unstated_time_unit(layout);
@@ -279,10 +281,11 @@ impl Judge<'_> {
     fn unstated_time_unit(&self, layout: &Layout) -> (&'static Unit, bool) {
         let raw = &self.samples.raw_times;
         let find = |symbol: &str| Unit::find(symbol).unwrap_or(layout.time.unit);
-        if let Some(unit) = raw.first().and_then(|&first| plausible::probable_stamp_unit(first)) {
+        let first = raw.iter().copied().find(|time| time.is_finite());
+        if let Some(unit) = first.and_then(plausible::probable_stamp_unit) {
             return (find(unit), false);
         }
-        let (Some(&first), true) = (raw.first(), raw.len() > 2) else { return (layout.time.unit, true) };
+        let (Some(first), true) = (first, raw.len() > 2) else { return (layout.time.unit, true) };
         if first > 1e8 {
             // Seconds since 1970.
             return (layout.time.unit, false);
@@ -415,7 +418,7 @@ impl Judge<'_> {
         }
         let samples = &self.samples;
         let largest = samples.currents.iter().filter(|i| i.is_finite()).fold(0.0_f64, |max, i| max.max(i.abs()));
-        let is_never_negative = samples.currents.iter().all(|&i| i.is_nan() || i >= -0.001 * largest);
+        let negative = samples.currents.iter().filter(|&&i| i < -0.001 * largest).count();
         let count = |wanted: Direction, is_positive: bool| {
             let rows = samples.directions.iter().zip(&samples.currents);
             rows.filter(|&(direction, &i)| {
@@ -424,6 +427,9 @@ impl Judge<'_> {
             .count()
         };
         let [discharges, charges] = [Direction::Discharge, Direction::Charge].map(|direction| count(direction, true));
+        // With charges and discharges of a positive current, single negative currents are faults of a magnitude.
+        let is_magnitude = charges > 0 && discharges > 0 && 100 * negative <= samples.currents.len();
+        let is_never_negative = negative == 0 || is_magnitude;
         let codes = if is_never_negative { self.codes(layout, times) } else { Vec::new() };
         if is_never_negative && discharges + charges + codes.len() > 0 {
             let noise_a = 0.01 * largest;

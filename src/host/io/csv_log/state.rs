@@ -109,7 +109,10 @@ impl CurrentSign {
             self.is_by_state = false;
             self.is_charge_positive = if is_discharge { !self.has_positive[1] } else { self.has_positive[0] };
         }
-        Some(if self.is_charge_positive { -value } else { value })
+        let discharge_a = if self.is_charge_positive { -value } else { value };
+        // A discharge in the state of a charge contradicts the sign that a single negative current has shown.
+        let is_contradicted = self.noise_a > 0.0 && direction == Some(Direction::Charge) && discharge_a > self.noise_a;
+        (!is_contradicted).then_some(discharge_a)
     }
 }
 
