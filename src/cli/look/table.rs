@@ -44,7 +44,7 @@ impl PackTable {
     pub(super) fn configuration(&self, args: &Args, file: &Path) -> Result<PackConfiguration, Failure> {
         let (cells, label) = (self.cells, self.label.cell());
         let cell = match (&args.known.model, label) {
-            (Some(model), _) => format!("cell_model = {:?}", named_from(file, model)?),
+            (Some(model), _) => format!("cell_model = {}", toml::Value::from(named_from(file, model)?)),
             (None, Some(label)) => {
                 format!("chemistry = {:?}\nrated_capacity_ah = {:?}", label.chemistry.name(), label.rated_ah)
             }
@@ -54,46 +54,36 @@ impl PackTable {
                 return Err(Failure::new(question));
             }
         };
-        let message =
-            |id: u32, name: &str, signal: &str| format!("BO_ {id} {name}: 8 Table\n SG_ {signal} Vector__XXX\n");
-        let mut database = message(256, "Pack", "Current : 0|32@1- (0.0001,0) [-200000|200000] \"A\"");
-        let voltage = match self.is_total {
-            true => {
-                database += &message(258, "Total", "Voltage : 0|32@1+ (0.0001,0) [0|400000] \"V\"");
-                "pack_voltage]\nsignal = \"Total.Voltage\""
-            }
+        let mut database = "VERSION \"\"\nNS_ :\nBS_:\nBU_: Table\n".to_owned();
+        let mut message = |id: u32, name: &str, signal: &str| {
+            database += &format!("BO_ {id} {name}: 8 Table\n SG_ {signal} Vector__XXX\n");
+        };
+        message(256, "Pack", "Current : 0|32@1- (0.0001,0) [-200000|200000] \"A\"");
+        message(257, "Sensor", "Temperature : 0|16@1- (0.01,0) [-273|327] \"degC\"");
+        message(258, "Total", "Voltage : 0|32@1+ (0.0001,0) [0|400000] \"V\"");
+        for n in 1..=u32::from(cells) {
+            message(512 + n, &format!("Cell{n}"), "Voltage : 0|24@1+ (0.00001,0) [0|167] \"V\"");
+        }
+        let voltage = match (self.is_total, cells) {
+            (true, _) => "pack_voltage]\nsignal = \"Total.Voltage\"",
+            (false, 1) => "cell_voltage]\nsignal = \"Cell1.Voltage\"",
+            (false, _) => "cell_voltage]\nsignal = \"Cell{n}.Voltage\"",
+        };
+        let (temperature, open) = match self.reading.has_temperature {
+            true => ("\n[[input.temperature]]\nsignal = \"Sensor.Temperature\"\n", None),
             false => {
-                let cell =
-                    |n: u32| message(512 + n, &format!("Cell{n}"), "Voltage : 0|24@1+ (0.00001,0) [0|167] \"V\"");
-                database.extend((1..=u32::from(cells)).map(cell));
-                if cells == 1 {
-                    "cell_voltage]\nsignal = \"Cell1.Voltage\""
-                } else {
-                    "cell_voltage]\nsignal = \"Cell{n}.Voltage\""
-                }
+                ("", Some("which temperature? the table has none that can be read: 25 degrees C (pack.ambient_c)"))
             }
         };
-        let mut open = Vec::new();
-        let temperature = if self.reading.has_temperature {
-            database += &message(257, "Sensor", "Temperature : 0|16@1- (0.01,0) [-273|327] \"degC\"");
-            "\n[[input.temperature]]\nsignal = \"Sensor.Temperature\"\n"
-        } else {
-            open.push(
-                "which temperature? the table has none that can be read, so 25 degrees C (pack.ambient_c) are assumed"
-                    .to_owned(),
-            );
-            ""
-        };
-        let own = named_from(file, &file.with_extension("dbc"))?;
+        let own = toml::Value::from(named_from(file, &file.with_extension("dbc"))?);
         let limits: String =
             ["current", "voltage", "temperature"].map(|name| format!("\n[limits.{name}]\nmax_age_s = 90.0\n")).concat();
         let text = format!(
-            "# Written by `packwatch look`.\n\n[pack]\ncells = {cells}\n{cell}\n\n[[interface]]\nname = \"vcan0\"\n\n[input]\ndbc = [{own:?}]\n\n\
+            "# Written by `packwatch look`.\n\n[pack]\ncells = {cells}\n{cell}\n\n[[interface]]\nname = \"vcan0\"\n\n[input]\ndbc = [{own}]\n\n\
              [input.current]\nsignal = \"Pack.Current\"\npositive = \"discharge\"\n\n[input.{voltage}\n{temperature}{limits}\n\
              [transition]\nmin_duration_s = 60.0\n"
         );
-        let database = format!("VERSION \"\"\nNS_ :\nBS_:\nBU_: Table\n{database}");
-        Ok(PackConfiguration { text, database: Some(database), open })
+        Ok(PackConfiguration { text, database: Some(database), open: open.map(str::to_owned).into_iter().collect() })
     }
 }
 

@@ -395,7 +395,7 @@ fn forms(rows: &[Sample]) -> Vec<Export> {
 
 /// Headers whose columns need a choice, and rows that need a decision.
 fn headers(rows: &[Sample]) -> Vec<Export> {
-    type Row<'a> = (&'a str, &'a str, &'a str, bool, &'a dyn Fn(Sample) -> String);
+    type Row<'a> = (&'static str, &'static str, &'a str, bool, &'a dyn Fn(Sample) -> String);
     let (a, v) = (|s: Sample| ampere(s.current_ma), volt);
     let charged = |s: Sample| ampere(-s.current_ma);
     let magnitude =
