@@ -62,13 +62,13 @@ pub(crate) struct Known {
     /// What the pack's label says, every part optional: chemistry, capacity, cells in series, such as nmc:64Ah:98s. Decides
     /// scales of undescribed fields; in a configuration, also describes the cell if --model is not given
     #[arg(long, value_name = "LABEL")]
-    label: Option<PackLabel>,
+    pub(crate) label: Option<PackLabel>,
     /// Cell model for the configuration
     #[arg(long, value_name = "CELL.toml")]
     pub(crate) model: Option<PathBuf>,
     /// Meaning of a positive current; needed if the log does not show it
     #[arg(long, value_enum)]
-    positive: Option<Positive>,
+    pub(crate) positive: Option<Positive>,
 }
 
 /// Sign of the current.
@@ -141,9 +141,7 @@ pub(crate) fn search(logs: &[PathBuf], known: &Known, channels: Vec<(String, Str
         let names = names.join(", ");
         return Err(Failure::new(match counts.tables.is_empty() {
             true => format!("{names}: no CAN frames; give a journal or a CAN log"),
-            false => format!(
-                "{names}: a table has no CAN frames; `packwatch report -c PACK.toml` and `packwatch score` read tables"
-            ),
+            false => format!("{names}: a table has no CAN frames; `packwatch look`, `report` and `score` read tables"),
         }));
     }
     Ok(Search { discoverer, discovery, counts, interfaces })

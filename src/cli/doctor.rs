@@ -131,7 +131,8 @@ fn again(args: &Args, changed: &mut Survey, survey: &Survey, interrupt: &Interru
 /// Judges logs with a configuration.
 #[cfg(feature = "lab")]
 pub(crate) fn judge(config: &Path, logs: &[PathBuf], reading: &LogReading) -> Result<WiringReport, Failure> {
-    let survey = wiring_check::survey(config)?;
+    let mut survey = wiring_check::survey(config)?;
+    survey.plan.is_csv = logs.iter().any(|log| has_table_name(log));
     let mut report = replay(logs, reading, None, &survey, &Interrupt::default())?;
     complete(&mut report, &survey);
     Ok(report)

@@ -1,16 +1,18 @@
 //! `packwatch look`: from logs to a verdict in one command.
 //!
 //! The command finds the battery's signals in the logs, makes the configuration that follows, checks the wiring, and
-//! replays the logs into a report. If the logs and the label leave a question open, the command asks it and says which
+//! replays the logs into a report. A table needs a label instead of a search. If the logs and the label leave a question open, the command asks it and says which
 //! option answers it. The exit code is 0 if a report was written, and 1 otherwise.
+
+mod table;
 
 use std::path::{Path, PathBuf};
 
 use packwatch_host::failure::Failure;
 
-use super::common::logs::{InputArgs, channel};
+use super::common::logs::{CsvSign, InputArgs, channel, charge_positive, column};
 use super::common::output::{failure, named, print, word};
-use super::discover::{self, Known, Search};
+use super::discover::{self, Known, Positive, Search};
 use super::{doctor, report};
 use crate::io::result_file::check_place;
 use crate::lab::discover::PackConfiguration;
@@ -18,6 +20,7 @@ use crate::lab::report::Verdict;
 use crate::replay::LogReading;
 use crate::wiring::evidence::PackQuantity;
 use crate::wiring::{Severity, WiringReport};
+use table::PackTable;
 
 /// Maximum number of lines about one subject. The report and the other commands have all of them.
 const MAX_SHOWN: usize = 8;
@@ -30,7 +33,7 @@ const INDENT: usize = 15;
 Finds the battery's signals like `discover`, makes the configuration that follows, checks the wiring like `doctor` and writes a report \
 like `report`. If something is not known, the command asks for it and writes no report.")]
 pub(crate) struct Args {
-    /// CAN logs of one battery in any known format, also .gz or .zst, read in this order
+    /// CAN logs or tables of one battery in any known format, also .gz or .zst, read in this order
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
     #[command(flatten)]
@@ -38,6 +41,9 @@ pub(crate) struct Args {
     /// Read a channel or interface of a log as this interface, as for `replay`
     #[arg(long = "channel", value_name = "CHANNEL=INTERFACE", value_parser = channel)]
     channels: Vec<(String, String)>,
+    /// Name a column of a table, as for `replay`
+    #[arg(long = "column", value_name = "ROLE=NAME", value_parser = column)]
+    columns: Vec<(String, String)>,
     /// Keep the configuration in this file, and the fields that no DBC describes in PACK.dbc. If the file exists, it is used
     /// and not changed
     #[arg(long, value_name = "PACK.toml")]
@@ -53,19 +59,34 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     if let Some(file) = args.files.iter().find(|file| *file == Path::new("-") || file.exists() && !file.is_file()) {
         return Err(named(file, "must be a file, because `look` reads its logs several times"));
     }
-    let search = discover::search(&args.files, &args.known, args.channels.clone())?;
-    print(&section("log", logs(args, &search)))?;
-    print(&section("signals", signals(&search)))?;
     let folder = tempfile::tempdir().map_err(failure)?;
     let config = args.write.clone().unwrap_or_else(|| folder.path().join("pack.toml"));
-    print(&section("configuration", configure(args, &search, &config)?))?;
+    let lines = if let Some(table) = PackTable::read(args)? {
+        print(&section("table", table.reading.to_string().split("; ").map(str::to_owned).collect()))?;
+        configure(args, &config, || table.configuration(args, &config))?
+    } else {
+        let search = discover::search(&args.files, &args.known, args.channels.clone())?;
+        print(&section("log", logs(args, &search)))?;
+        print(&section("signals", signals(&search)))?;
+        configure(args, &config, || {
+            let open =
+                |questions| Failure::new(format!("please answer, so that the battery can be judged:\n{questions}"));
+            search.configuration(&args.files[0], &args.known, &config)?.map_err(open)
+        })?
+    };
+    print(&section("configuration", lines))?;
     let survey = doctor::judge(&config, &args.files, &args.reading())?;
     print(&section("wiring", wiring(&survey)))?;
     let page = report::Args {
         config: Some(config),
         logs: args.files.clone(),
         out: args.out.clone(),
-        input: InputArgs { channels: args.channels.clone(), ..InputArgs::default() },
+        input: InputArgs {
+            channels: args.channels.clone(),
+            columns: args.columns.clone(),
+            csv_sign: args.csv_sign(),
+            ..InputArgs::default()
+        },
         state: None,
         plots: None,
         reference: None,
@@ -77,7 +98,19 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
 
 impl Args {
     fn reading(&self) -> LogReading {
-        LogReading { channels: self.channels.clone(), ..LogReading::default() }
+        LogReading {
+            channels: self.channels.clone(),
+            columns: self.columns.clone(),
+            charge_positive: charge_positive(self.csv_sign()),
+            ..LogReading::default()
+        }
+    }
+
+    fn csv_sign(&self) -> Option<CsvSign> {
+        self.known.positive.map(|positive| match positive {
+            Positive::Charge => CsvSign::Charge,
+            Positive::Discharge => CsvSign::Discharge,
+        })
     }
 }
 
@@ -116,15 +149,17 @@ fn signals(search: &Search) -> Vec<String> {
 }
 
 /// Writes the configuration unless the file exists. Returns what it contains or leaves open.
-fn configure(args: &Args, search: &Search, file: &Path) -> Result<Vec<String>, Failure> {
+fn configure(
+    args: &Args,
+    file: &Path,
+    make: impl FnOnce() -> Result<PackConfiguration, Failure>,
+) -> Result<Vec<String>, Failure> {
     let name = file.display();
     if args.write.is_some() && file.exists() {
         let ignored = if args.known.has_answers() { "; --label, --model and --positive are not used" } else { "" };
         return Ok(vec![format!("{name} exists, so it is used as it is{ignored}")]);
     }
-    let pack: PackConfiguration = search
-        .configuration(&args.files[0], &args.known, file)?
-        .map_err(|questions| Failure::new(format!("please answer, so that the battery can be judged:\n{questions}")))?;
+    let pack = make()?;
     let own = file.with_extension("dbc");
     if pack.database.is_some() && own.exists() {
         let advice = "exists and would be replaced; give it with --dbc, or give --write another name";

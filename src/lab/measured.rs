@@ -2,7 +2,8 @@
 //!
 //! In: a table in a form that [`CsvLog`] reads, of one cell. Out: the parts of the file. The time restarts at each new
 //! value of the part column (`cycle`, `segment` or `ref`). The column `type` names the kind of a part. An empty field
-//! becomes NaN, except the time. An empty time, or a field that is not a number, causes an error that names the line.
+//! becomes NaN, except the time. Rows with an empty time, or a field that is not a number, are left out and counted. If
+//! more than 1 % of the rows are, the first of them is the error.
 
 use std::path::{Path, PathBuf};
 
@@ -34,9 +35,17 @@ impl MeasuredFile {
     pub fn read(path: &Path, options: &CsvOptions) -> Result<Self, TableError> {
         let mut log = CsvLog::open_path(path, &CsvOptions { cells: 1, sensors: 1, series: 1, ..options.clone() })?;
         let mut parts: Vec<MeasuredPart> = Vec::new();
+        let mut first_bad = None;
         while let Some(row) = log.next_row()? {
-            // A division gives the number that the file states; `Timestamp::secs` may differ in the last bit.
-            add_row(row?.time.nanos() as f64 / 1e9, &log, &mut parts);
+            match row {
+                // A division gives the number that the file states; `Timestamp::secs` may differ in the last bit.
+                Ok(row) => add_row(row.time.nanos() as f64 / 1e9, &log, &mut parts),
+                Err(error) => first_bad = first_bad.or(Some(error)),
+            }
+        }
+        let bad_rows = log.reading().rows - log.reading().read;
+        if let Some(error) = first_bad.filter(|_| 100 * bad_rows > log.reading().rows) {
+            return Err(error);
         }
         if parts.is_empty() {
             return Err(log.header().file_fault("no rows after the header"));
@@ -119,6 +128,9 @@ mod tests {
             found,
             Err("cell.csv:3: column current_a: found \"x\", must be a finite number or an empty field".into())
         );
+        let rows: String = (0..200).map(|n| format!("{n},1,3.5\n")).collect();
+        let file = read(&format!("time_s,current_a,voltage_v\n{rows}x,1,3.5\n")).expect("one bad row of 201");
+        assert_eq!((file.rows(), file.reading.rows, file.reading.read), (200, 201, 200));
         let found = read("time_s,voltage_v\n0,3.5\n");
         assert!(
             found.is_err_and(|error| error.starts_with("cell.csv:1: no column for current, found time_s,voltage_v;"))

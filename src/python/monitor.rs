@@ -9,9 +9,11 @@ use std::path::{Path, PathBuf};
 use packwatch_host::can::decode::{Channel, SensorIndex};
 use packwatch_host::can::{CanId, Frame};
 use packwatch_host::config::Config;
+use packwatch_host::io::plausible;
+use packwatch_host::monitor::MonitorConfig;
 use packwatch_host::quantity::{BusIndex, CellIndex, Timestamp};
 use packwatch_host::replay::MonitorDriver;
-use packwatch_host::sample::{Limits, SampleConfig, VoltageSource};
+use packwatch_host::sample::{Limits, VoltageSource};
 use packwatch_lab::single_cell::CellSource;
 use pyo3::prelude::*;
 
@@ -125,6 +127,7 @@ impl Monitor {
         };
         input.check(time_s.rows, if self.is_pack_total { 1 } else { usize::from(self.cells) })?;
         self.limits.check(&input)?;
+        self.limits.check_time(&time_s, &input)?;
         self.work(py, progress, &time_s, |state, work| state.take_rows(&time_s, &input, work))
     }
 
@@ -191,7 +194,7 @@ impl Monitor {
             interfaces: config.interface_names(),
             cells: sample.cells,
             is_pack_total: matches!(sample.voltage_source, VoltageSource::PackTotal { .. }),
-            limits: PlausibleRanges::new(sample),
+            limits: PlausibleRanges::new(&config.monitor),
             state: ExclusiveState::new(State {
                 driver,
                 columns: Columns::default(),
@@ -352,10 +355,12 @@ struct PlausibleRanges {
     current_a: (f64, f64),
     voltage_v: (f64, f64),
     temperature_c: (f64, f64),
+    capacity_ah: f64,
 }
 
 impl PlausibleRanges {
-    fn new(sample: &SampleConfig) -> Self {
+    fn new(config: &MonitorConfig) -> Self {
+        let sample = &config.sample;
         let range = |limits: &Limits| (limits.min, limits.max);
         let (low, high) = range(&sample.voltage);
         let cells = match sample.voltage_source {
@@ -363,7 +368,20 @@ impl PlausibleRanges {
             VoltageSource::Cells => 1.0,
         };
         let voltage_v = (low * cells, high * cells);
-        Self { current_a: range(&sample.current), voltage_v, temperature_c: range(&sample.temperature) }
+        let capacity_ah = config.model.rated_capacity_ah * f64::from(sample.strings);
+        Self { current_a: range(&sample.current), voltage_v, temperature_c: range(&sample.temperature), capacity_ah }
+    }
+
+    /// Checks that the current moves a possible charge, if the times are seconds.
+    fn check_time(&self, time_s: &Reals, input: &RowInput) -> PyResult<()> {
+        const MOST_ROWS: usize = 50_000;
+        let rows = time_s.rows.min(MOST_ROWS);
+        plausible::check_charge(&time_s.values[..rows], &input.current_a.values[..rows], self.capacity_ah).map_err(
+            |of| {
+                let unit = of.probable.unwrap_or("ms");
+                data(format!("time_s must be seconds, probably {unit}: {}", of.what))
+            },
+        )
     }
 
     /// Checks that the values are not in another unit.

@@ -172,6 +172,16 @@ fn look_writes_report_or_asks() {
     let text = stderr(&packwatch(&["look", log, "--label", "nmc:2.6Ah:4s", "--out", &out, "--write", &car]).code(1));
     assert!(text.contains("car.dbc: exists and would be replaced"), "{text}");
     assert_eq!(fs::read_to_string(&own).unwrap(), "MINE");
+    // A table needs the label only.
+    let table = path("drive.csv");
+    let row = |n: i32| format!("{n},{},{:.3}\n", n / 20 % 3, 3.9 - f64::from(n) * 1e-4 - 0.04 * f64::from(n / 20 % 3));
+    fs::write(&table, format!("time,current,voltage\n{}", (0..900).map(row).collect::<String>())).unwrap();
+    let text = stdout(&packwatch(&["look", &table, "--label", "nmc:2.6Ah", "--out", &out]).success());
+    for part in ["column 2 \"current\" in A (assumed), discharge positive", "which temperature?", "wiring", "battery"] {
+        assert!(text.contains(part), "{part} is not in: {text}");
+    }
+    let text = stderr(&packwatch(&["look", &table, "--out", &out]).code(1));
+    assert!(text.contains("which battery is it?"), "{text}");
     // An edited configuration is used and kept.
     let edited = fs::read_to_string(&pack).unwrap().replace("rated_capacity_ah = 2.6", "rated_capacity_ah = 2.5");
     fs::write(&pack, &edited).unwrap();

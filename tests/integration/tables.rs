@@ -145,6 +145,21 @@ fn values_in_wrong_unit_are_refused_by_name() {
         ("magnitude", scaled(&magnitude, own, [1.0; 3]), &[], "the current is never negative"),
         ("wrong column", scaled(&rows, own, [1.0; 3]), &[("current", "voltage_v")], "cannot be the current"),
         (
+            "unknown unit",
+            scaled(&rows, "time_s,Current (furlong),voltage_v", [1.0; 3]),
+            &[],
+            "unknown unit \"furlong\"",
+        ),
+        (
+            "unknown unit in a row",
+            scaled(&rows, "Time,Current,Voltage\ns,furlong,V", [1.0; 3]),
+            &[],
+            "unknown unit \"furlong\"",
+        ),
+        ("constant time", scaled(&rows, own, [0.0, 1.0, 1.0]), &[], "less than 1 us per row"),
+        ("less than a microsecond", scaled(&rows, own, [1e-8, 1.0, 1.0]), &[], "less than 1 us per row"),
+        ("no cell", scaled(&rows, own, [1.0, 1.0, 0.05]), &[], "half of the readings are below"),
+        (
             "unknown header",
             scaled(&rows, "time_s,strom,voltage_v", [1.0; 3]),
             &[],
@@ -160,6 +175,40 @@ fn values_in_wrong_unit_are_refused_by_name() {
     let path = bench.file("x.csv", &scaled(&rows, own, [1.0 / 60.0, 1.0, 1.0]));
     let (_, counts) = bench.replay(&path, &[]).expect("reads");
     assert!(counts.tables[0].to_string().contains("advances like min"), "{}", counts.tables[0]);
+    // An impossible temperature costs its column only.
+    let text = String::from_utf8(plain(&rows, true)).unwrap().replace(",25\n", ",850\n");
+    let (_, counts) = bench.replay(&bench.file("x.csv", text.as_bytes()), &[]).expect("reads");
+    assert!(counts.tables[0].to_string().contains("temperature_c is left out: 850"), "{}", counts.tables[0]);
+}
+
+#[test]
+fn stated_seconds_draw_no_remark() {
+    let (bench, rows) = (Bench::new(1), drive());
+    for (step_s, wobble_s) in [(0.1, 0.0), (0.1, 0.003), (0.5, 0.0), (0.5, 0.02), (1.0, 0.03), (60.0, 0.0), (60.0, 0.4)]
+    {
+        let row = |(n, s): (usize, &Sample)| {
+            let time_s = n as f64 * step_s + wobble_s * (n as f64 * 2.4).sin().abs();
+            format!("{time_s:.3},{},{}\n", f64::from(s.current_ma) / 1000.0, f64::from(s.voltage_mv) / 1000.0)
+        };
+        let text =
+            format!("time_s,current_a,voltage_v\n{}", rows.iter().take(300).enumerate().map(row).collect::<String>());
+        let (_, counts) = bench.replay(&bench.file("x.csv", text.as_bytes()), &[]).expect("reads");
+        assert!(!counts.tables[0].to_string().contains("--column"), "{step_s} s: {}", counts.tables[0]);
+    }
+}
+
+#[test]
+fn damaged_time_costs_its_row() {
+    let (bench, rows) = (Bench::new(1), drive());
+    for damaged in ["99999999999999", "x", "5", "9000000", "-7"] {
+        let text = String::from_utf8(plain(&rows, false)).unwrap().replace("\n300,", &format!("\n{damaged},"));
+        let (found, counts) = bench.replay(&bench.file("x.csv", text.as_bytes()), &[]).expect("reads");
+        assert_eq!((counts.bad_lines, counts.time_backwards), (1, 0), "{damaged}");
+        assert!(
+            counts.first_bad_line.is_some_and(|bad| bad.contains("x.csv:302: column time_s: found"))
+                && found.len() >= 899
+        );
+    }
 }
 
 #[test]
@@ -215,6 +264,10 @@ fn control_bytes_of_header_are_escaped() {
     let error = bench.replay(&path, &[]).expect_err("no current");
     assert!(!error.chars().any(|c| c.is_control() || c == '\u{202e}'), "{error:?}");
     assert!(error.contains("\\u{1b}[31mred"), "{error}");
+    let path = bench.file("x.csv", "time_s\u{7},Current\u{1b}[31m (A),voltage_v\n0,1,3.7\n1,1,3.7\n".as_bytes());
+    let columns = [("time", "time_s\\u{7}"), ("current", "Current\\u{1b}[31m (A)")];
+    let said = bench.replay(&path, &columns).expect("reads").1.tables[0].to_string();
+    assert!(!said.chars().any(char::is_control), "{said:?}");
 }
 
 #[test]

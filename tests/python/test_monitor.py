@@ -279,6 +279,8 @@ def test_readings_in_other_unit_name_the_unit(record):
         with pytest.raises(pw.DataError) as caught:
             pw.Monitor(PAPER).rows(time_s, *given)
         assert text in str(caught.value) and re.search(": probably (mV|mA|K): ", str(caught.value))
+    with pytest.raises(pw.DataError, match="time_s must be seconds, probably ms: the current moves"):
+        pw.Monitor(PAPER).rows((time_s - time_s[0]) * 1000, current_a, voltage_v)
 
 
 def test_monitor_continues_unchanged_after_fault(record):

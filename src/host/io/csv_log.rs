@@ -19,17 +19,22 @@ mod dictionary;
 mod judge;
 mod layout;
 mod reading;
+mod state;
 mod time_text;
 
-use super::plausible::PackSize;
+use super::plausible::{PackSize, probable_stamp_unit};
 use super::table::{Header, Quotes, Row, Table, TableError};
 use crate::can::decode::Channel;
 use crate::quantity::Timestamp;
 pub use dictionary::BDF_COLUMNS;
-use judge::{CurrentSign, Judgement, direction};
+use judge::Judgement;
 use layout::{Column, Layout};
 pub use reading::TableReading;
+use state::{CurrentSign, is_rest};
 use time_text::TimeText;
+
+/// Largest number of rows that are judged before the first row is returned.
+const MAX_JUDGED_ROWS: usize = 50_000;
 
 /// Options for reading tables of samples.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -72,6 +77,7 @@ pub struct CsvLog {
     table: Table,
     time_column: usize,
     time: TimeText,
+    last_time: Option<Timestamp>,
     /// The column of each used channel.
     channels: Vec<(Channel, Column)>,
     sign: CurrentSign,
@@ -143,15 +149,17 @@ impl CsvLog {
     /// Fails if the source cannot be read, a column is missing, values cannot be in the unit that the header states, or
     /// the table of start times is faulty.
     pub fn open(source: Box<dyn Read>, path: &Path, options: &CsvOptions) -> Result<Self, TableError> {
-        let (table, mut preview) = open_table(source, path, options)?;
-        let mut layout = Layout::find(table.header(), options)?;
-        let judgement = judge::judge(&mut preview, &mut layout, options)?;
+        let (table, preview) = open_table(source, path, options)?;
+        let first = preview.first_rows(MAX_JUDGED_ROWS);
+        let mut layout = Layout::find(&first, options)?;
+        let judgement = judge::judge(&first, &mut layout, options)?;
         let sections = sections(table.header(), layout.section, options)?;
         let reading = TableReading::new(table.header(), &layout, &judgement, options);
         let Judgement { time, sign, .. } = judgement;
         Ok(Self {
             time_column: layout.time.index,
             time,
+            last_time: None,
             values: Vec::with_capacity(layout.channels.len()),
             channels: layout.channels,
             sign,
@@ -194,28 +202,45 @@ impl CsvLog {
     /// # Errors
     /// Fails if the source fails.
     pub fn next_row(&mut self) -> Result<Option<Result<RowTime, TableError>>, TableError> {
-        let Some(row) = self.table.next_row()? else { return Ok(None) };
+        let Some((row, after)) = self.table.next_rows()? else { return Ok(None) };
         self.values.clear();
         self.reading.rows += 1;
-        let Some(time) = self.time.parse(row.bytes(self.time_column).unwrap_or_default()) else {
-            return Ok(Some(Err(row.fault(self.time_column, "a time"))));
+        let is_possible = |time: &Timestamp| probable_stamp_unit(time.secs()).is_none();
+        let Some(time) = self.time.parse(row.bytes(self.time_column).unwrap_or_default()).filter(is_possible) else {
+            return Ok(Some(Err(row.fault(self.time_column, "a time before the year 2100"))));
         };
+        let before = self.last_time.filter(|_| self.sections.is_none());
+        if let (Some(before), Some(after)) =
+            (before, after.and_then(|row| self.time.clone().parse(row.bytes(self.time_column).unwrap_or_default())))
+            && before <= after
+            && !(before..=after).contains(&time)
+            && is_possible(&after)
+        {
+            return Ok(Some(Err(row.fault(self.time_column, "between the times of the rows around it"))));
+        }
+        self.last_time = Some(time);
         for &(channel, column) in &self.channels {
-            let Some(value) = row.bytes(column.index).and_then(|_| row.parsed(column.index)) else {
-                return Ok(Some(Err(row.fault(column.index, "a finite number or an empty field"))));
+            let Some(value) = row.parsed(column.index) else {
+                return Ok(Some(Err(row.fault(column.index, NUMBER))));
             };
             let value = value.map(|value| column.unit.convert(value));
-            let value = if channel == Channel::Current {
-                value.and_then(|v| self.reading.check(signed(&mut self.sign, v, &row, self.state), self.max_current_a))
-            } else {
-                value
+            let value = match (channel, value) {
+                (Channel::Current, Some(current_a)) => {
+                    let state = self.state.filter(|_| self.sign.noise_a > 0.0);
+                    if let Some(fault) = state.and_then(|state| unknown_state(&self.sign, &row, state, current_a)) {
+                        return Ok(Some(Err(fault)));
+                    }
+                    let direction = state.and_then(|state| self.sign.direction(row.bytes(state).unwrap_or_default()));
+                    self.reading.check(self.sign.discharge(current_a, direction), self.max_current_a)
+                }
+                (_, value) => value,
             };
             self.values.push((channel, value));
         }
         self.discharged_ah = f64::NAN;
         if let Some((column, factor)) = &self.discharged {
             let Some(value) = row.parsed(column.index) else {
-                return Ok(Some(Err(row.fault(column.index, "a finite number or an empty field"))));
+                return Ok(Some(Err(row.fault(column.index, NUMBER))));
             };
             self.discharged_ah = value.map_or(f64::NAN, |value| factor * column.unit.convert(value) + 0.0);
         }
@@ -231,10 +256,15 @@ impl CsvLog {
     }
 }
 
-/// The current with positive = discharge; `None` if it contradicts the state column.
-fn signed(sign: &mut CurrentSign, value: f64, row: &Row<'_>, state: Option<usize>) -> Option<f64> {
-    let state = state.filter(|_| sign.is_by_state).and_then(|column| row.bytes(column));
-    sign.discharge(value, state.and_then(direction))
+/// Allowed values of a field, for messages.
+const NUMBER: &str = "a finite number or an empty field";
+
+/// The fault of a row whose current is a magnitude and whose state is unknown.
+fn unknown_state(sign: &CurrentSign, row: &Row<'_>, state: usize, current_a: f64) -> Option<TableError> {
+    let text = row.bytes(state).unwrap_or_default();
+    let is_known =
+        !sign.is_by_state || current_a.abs() <= sign.noise_a || sign.direction(text).is_some() || is_rest(text);
+    (!is_known).then(|| row.fault(state, "charge, discharge or rest, because the current has no sign"))
 }
 
 /// Opens a table, and a second one for a look at the first rows.

@@ -14,7 +14,7 @@ const MAX_CURRENT_A: f64 = 2000.0;
 const MAX_CELL_V: f64 = 20.0;
 
 /// Smallest plausible median voltage of a cell (V).
-const MIN_CELL_V: f64 = 0.1;
+const MIN_CELL_V: f64 = 0.5;
 
 /// Smallest and largest plausible product of a cell's resistance and capacity (ohm Ah). Usual cells have 0.02 to 0.5, so
 /// a factor of 1000 in the current is outside.
@@ -29,9 +29,9 @@ const MAX_SHARE: f64 = 0.01;
 /// Largest plausible charge that a cell gives or takes without a return, as multiple of its capacity.
 const MAX_CAPACITIES: f64 = 3.0;
 
-/// Step between rows from which the charge is compared with the capacity (s). A table in milliseconds seems to have
-/// such steps. Shorter steps prove nothing, because a sensor's offset adds up over months.
-const MIN_SLOW_STEP_S: f64 = 50.0;
+/// Largest plausible change of the mean voltage, relative to the charge (V per capacity). At the ends of its curve a cell
+/// has up to 30.
+const MAX_SLOPE_V: f64 = 40.0;
 
 /// Last plausible date: 2100-01-01 (s since 1970).
 const LAST_DATE_S: f64 = 4_102_444_800.0;
@@ -82,11 +82,9 @@ fn probable_step_unit(step_s: f64) -> &'static str {
 /// Checks the times of rows (s).
 ///
 /// # Errors
-/// A time is after 2100.
+/// More than 1 % of the times are after 2100.
 pub fn check_dates(time_s: &[f64]) -> Result<(), Implausible> {
-    let Some(late) = time_s.iter().copied().find(|&time_s| probable_stamp_unit(time_s).is_some()) else {
-        return Ok(());
-    };
+    let Some(late) = beyond(time_s, LAST_DATE_S) else { return Ok(()) };
     let first = time_s.first().copied().and_then(probable_stamp_unit);
     let probable = first.unwrap_or_else(|| probable_step_unit(median_step(time_s).unwrap_or_default()));
     implausible("time", Some(probable), format!("{late} is after the year 2100 as seconds since 1970"))
@@ -95,8 +93,14 @@ pub fn check_dates(time_s: &[f64]) -> Result<(), Implausible> {
 /// Checks the order of the times of rows (s).
 ///
 /// # Errors
-/// More than a fifth of the times are before the time of the previous row.
+/// More than a fifth of the times are before the time of the previous row, or ten rows or more advance by less than 1 us
+/// each.
 pub fn check_order(time_s: &[f64]) -> Result<(), Implausible> {
+    let known = || time_s.iter().copied().filter(|time_s| time_s.is_finite());
+    let span_s = known().fold(f64::MIN, f64::max) - known().fold(f64::MAX, f64::min);
+    if time_s.len() >= 10 && (0.0..1e-6 * time_s.len() as f64).contains(&span_s) {
+        return implausible("time", None, "advances by less than 1 us per row".to_owned());
+    }
     let back = time_s.windows(2).filter(|pair| pair[1] < pair[0]).count();
     if back * 5 <= time_s.len() {
         return Ok(());
@@ -104,8 +108,13 @@ pub fn check_order(time_s: &[f64]) -> Result<(), Implausible> {
     implausible("time", None, format!("runs backwards in {back} of {} rows", time_s.len()))
 }
 
+/// Longest step that is not a gap: ten times the median step.
+pub(super) fn longest_step(time_s: &[f64]) -> f64 {
+    10.0 * median_step(time_s).unwrap_or_default()
+}
+
 /// The median step between times (s).
-fn median_step(time_s: &[f64]) -> Option<f64> {
+pub(super) fn median_step(time_s: &[f64]) -> Option<f64> {
     median(&time_s.windows(2).map(|pair| pair[1] - pair[0]).collect::<Vec<_>>())
 }
 
@@ -168,23 +177,73 @@ pub fn check_response(
     check_charge(time_s, current_a, capacity_ah)
 }
 
-/// Checks that the charge stays within a few capacities, if the steps of time are long.
-fn check_charge(time_s: &[f64], current_a: &[f64], capacity_ah: f64) -> Result<(), Implausible> {
-    let steps_s: Vec<f64> = time_s.windows(2).map(|pair| pair[1] - pair[0]).collect();
-    let Some(step_s) = median(&steps_s).filter(|step_s| *step_s >= MIN_SLOW_STEP_S) else { return Ok(()) };
-    let (mut charge_ah, mut low_ah, mut high_ah) = (0.0_f64, 0.0_f64, 0.0_f64);
-    for (step_s, current_a) in steps_s.iter().zip(current_a) {
-        if *step_s > 0.0 && current_a.is_finite() {
-            charge_ah += current_a * step_s / 3600.0;
-            (low_ah, high_ah) = (low_ah.min(charge_ah), high_ah.max(charge_ah));
+/// Checks that the charge stays within a few capacities. After a gap, in which a charge may be missing, it counts anew.
+/// Currents below a twentieth of the
+/// capacity per hour do not count: the offset of a sensor adds up over months.
+///
+/// # Errors
+/// The current moves more than three capacities, and less than half a capacity back in between.
+pub fn check_charge(time_s: &[f64], current_a: &[f64], capacity_ah: f64) -> Result<(), Implausible> {
+    let longest_s = longest_step(time_s);
+    let mut span_ah = 0.0_f64;
+    for sign in [1.0, -1.0] {
+        let (mut charge_ah, mut low_ah, mut high_ah) = (0.0_f64, 0.0_f64, 0.0_f64);
+        for (pair, current_a) in time_s.windows(2).zip(current_a) {
+            let step_s = pair[1] - pair[0];
+            if current_a.abs() >= 0.05 * capacity_ah && (0.0..=longest_s).contains(&step_s) {
+                charge_ah += sign * current_a * step_s / 3600.0;
+            }
+            high_ah = high_ah.max(charge_ah);
+            if step_s > longest_s || charge_ah < low_ah || charge_ah < high_ah - 0.5 * capacity_ah {
+                (low_ah, high_ah) = (charge_ah, charge_ah);
+            }
+            span_ah = span_ah.max(high_ah - low_ah);
         }
     }
-    let span_ah = high_ah - low_ah;
     if span_ah <= MAX_CAPACITIES * capacity_ah {
         return Ok(());
     }
-    let what = format!("the current moves {span_ah:.0} Ah, but the capacity is {capacity_ah} Ah");
-    implausible("time", Some(probable_step_unit(step_s)), what)
+    let what = format!("the current moves {span_ah:.0} Ah one way, but the rated capacity is {capacity_ah} Ah");
+    implausible("time", Some(probable_step_unit(median_step(time_s).unwrap_or_default())), what)
+}
+
+/// Checks that enough charge flows for the change of the mean voltage from one tenth of the rows to another. Only tenths
+/// with a mean current of the same sign count: after a load, the voltage recovers without a charge.
+///
+/// # Errors
+/// The voltage changes by more than 40 V per capacity.
+pub fn check_slope(
+    time_s: &[f64],
+    current_a: &[f64],
+    cell_voltage_v: &[f64],
+    capacity_ah: f64,
+) -> Result<(), Implausible> {
+    let rows = time_s.len().min(current_a.len()).min(cell_voltage_v.len());
+    let part = (rows / 10).max(1);
+    let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
+    let parts: Vec<(f64, f64, f64)> = (0..rows / part)
+        .map(|n| n * part..(n + 1) * part)
+        .map(|of| (mean(&time_s[of.clone()]), mean(&current_a[of.clone()]), mean(&cell_voltage_v[of])))
+        .collect();
+    let largest = parts.iter().fold(0.0_f64, |max, part| max.max(part.1.abs()));
+    for (n, first) in parts.iter().enumerate().filter(|_| rows >= 20) {
+        let mut charge_ah = 0.0;
+        for pair in
+            parts[n..].windows(2).take_while(|pair| pair[1].1 * first.1 > 0.0 && pair[1].1.abs() > 0.7 * largest)
+        {
+            charge_ah += (pair[1].0 - pair[0].0) * (pair[0].1 + pair[1].1).abs() / 2.0 / 3600.0;
+            let (change_v, capacities) = (pair[1].2 - first.2, charge_ah / capacity_ah);
+            if first.1.abs() > 0.7 * largest && change_v.abs() > 0.2 && change_v.abs() > MAX_SLOPE_V * capacities {
+                let what = format!(
+                    "moves {:.2} % of the capacity while the voltage changes by {change_v:.2} V",
+                    100.0 * capacities
+                );
+                let unit = if change_v.abs() > 60.0 * MAX_SLOPE_V * capacities { "h" } else { "min" };
+                return implausible("time", Some(unit), what);
+            }
+        }
+    }
+    Ok(())
 }
 
 /// Direction of positive current that the voltage's answers to current steps show.
@@ -227,12 +286,18 @@ pub fn shown_sign(time_s: &[f64], current_a: &[f64], cell_voltage_v: &[f64]) -> 
     if discharge > charge { ShownSign::Discharge } else { ShownSign::Charge }
 }
 
-/// Changes of current and voltage from row to row. Rows after a gap do not count: the recorder may have missed a charge.
+/// Changes of current and voltage from row to row, of the rows that have both. Rows after a gap do not count: the recorder
+/// may have missed a charge.
 fn steps(time_s: &[f64], current_a: &[f64], voltage_v: &[f64]) -> Vec<(f64, f64)> {
-    let longest_s = 10.0 * median_step(time_s).unwrap_or_default();
-    let pairs = time_s.windows(2).zip(current_a.windows(2).zip(voltage_v.windows(2)));
-    let near = pairs.filter(|(time_s, _)| (0.0..=longest_s).contains(&(time_s[1] - time_s[0])));
-    near.map(|(_, (i, v))| (i[1] - i[0], v[1] - v[0])).filter(|(i, v)| i.is_finite() && v.is_finite()).collect()
+    let rows = time_s
+        .iter()
+        .zip(current_a)
+        .zip(voltage_v)
+        .map(|((time_s, current_a), voltage_v)| [*time_s, *current_a, *voltage_v]);
+    let rows: Vec<[f64; 3]> = rows.filter(|row| row.iter().all(|value| value.is_finite())).collect();
+    let longest_s = longest_step(&rows.iter().map(|row| row[0]).collect::<Vec<_>>());
+    let near = rows.windows(2).filter(|pair| (0.0..=longest_s).contains(&(pair[1][0] - pair[0][0])));
+    near.map(|pair| (pair[1][1] - pair[0][1], pair[1][2] - pair[0][2])).collect()
 }
 
 /// For each stretch of constant current: whether a positive current discharges. The voltage falls at a discharge and
@@ -325,6 +390,21 @@ mod tests {
             let stamps: Vec<f64> = time.iter().map(|time| (1.7e9 + time) * factor).collect();
             assert_eq!(found(check(&stamps, &current, &voltage)), Some(("time", Some(unit))));
         }
+    }
+
+    #[test]
+    fn gaps_and_offsets_do_not_count_as_charge() {
+        let check = |time_s: &[f64], current_a: &[f64]| check_charge(time_s, current_a, 3.0).is_ok();
+        let minutes: Vec<f64> = (0..40_000).map(|n| 60.0 * f64::from(n)).collect();
+        let cycles: Vec<f64> = (0..40_000).map(|n| if n / 100 % 2 == 0 { 1.5 } else { -1.47 }).collect();
+        assert!(check(&minutes, &vec![0.1; 40_000]) && check(&minutes, &cycles));
+        assert!(check(&[0.0, 60.0, 120.0, 360_000.0, 360_060.0], &[3.0; 5]) && !check(&minutes, &vec![1.0; 40_000]));
+        // A discharge in an hour, stated in minutes but read as seconds.
+        let (time, current) = ((0..60).map(f64::from).collect::<Vec<_>>(), [3.0; 60]);
+        let voltage: Vec<f64> = time.iter().map(|time| 4.1 - time / 60.0).collect();
+        let slope =
+            |factor: f64| check_slope(&scaled(&time, factor), &current, &voltage, 3.0).err().and_then(|of| of.probable);
+        assert_eq!((slope(1.0), slope(60.0)), (Some("min"), None));
     }
 
     #[test]

@@ -72,8 +72,12 @@ fn split_offset(time: &str) -> Option<(&str, i64)> {
     let time = time.strip_suffix('Z').unwrap_or(time);
     let Some(start) = time.rfind(['+', '-']) else { return Some((time, 0)) };
     let digits = time[start + 1..].replace(':', "");
-    let (hours, minutes) =
-        (number(digits.get(..2)?)?, number(digits.get(2..).filter(|m| !m.is_empty()).unwrap_or("0"))?);
+    let minutes = match digits.len() {
+        2 => 0,
+        4 => number(digits.get(2..)?)?,
+        _ => return None,
+    };
+    let hours = number(digits.get(..2)?)?;
     let seconds = hours * 3600 + minutes * 60;
     Some((time[..start].trim_end(), if time.as_bytes()[start] == b'-' { -seconds } else { seconds }))
 }
@@ -219,9 +223,19 @@ mod tests {
         }
         let hour = |text: &str| parse_date(text, false).map(|time| time.nanos() / 3_600_000_000_000 % 24);
         assert_eq!((hour("11/14/2023 12:00:00 AM"), hour("11/14/2023 12:00:00 PM")), (Some(0), Some(12)));
-        for bad in ["14/11/2023 22:13:20", "2023-11-14", "11/14/2023 13:00:00 PM", "a b", "1/2/3/4 5:6:7"] {
+        let long_offset = "2023-11-14T22:13:20+01999999999";
+        for bad in [long_offset, "14/11/2023 22:13:20", "2023-11-14", "11/14/2023 13:00:00 PM", "a b", "1/2/3/4 5:6:7"]
+        {
             assert_eq!(parse_date(bad, false), None, "{bad}");
         }
+    }
+
+    #[test]
+    fn any_text_of_a_time_is_read_or_refused() {
+        proptest::proptest!(|(text in "[0-9:dT .,+/-]{0,30}|.{0,20}", is_day_first: bool)| {
+            let _ = (parse_date(&text, is_day_first), parse_clock(&text), parse_stamp(&text));
+            let _ = parse_date(&format!("2023-11-14 {text}"), is_day_first);
+        });
     }
 
     #[test]

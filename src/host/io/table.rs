@@ -55,8 +55,8 @@ impl TableError {
 pub enum Quotes {
     /// Quotes may enclose fields that hold commas or line breaks.
     Enclose,
-    /// Every line is a row, regardless of quotes in it. Otherwise, one stray quote would swallow all later rows. Quotes
-    /// around a whole number or column name are still removed.
+    /// Every line is a row. Otherwise, one stray quote would swallow all later rows. Within a line, quotes may enclose
+    /// fields that hold separators. Quotes around a whole number or column name are removed.
     Literal,
 }
 
@@ -67,6 +67,9 @@ const MAX_LISTED_COLUMNS: usize = 64;
 pub struct Table {
     rows: Rows,
     record: csv::ByteRecord,
+    next: csv::ByteRecord,
+    /// Line of `next`, or why it could not be read; `None` = `next` is not read yet.
+    ahead: Option<Result<Option<u64>, TableError>>,
     header: Header,
 }
 
@@ -78,6 +81,8 @@ enum Rows {
         since_row: Rc<Cell<usize>>,
         /// Number of lines before the first row.
         lines_before: u64,
+        /// The separator, if quotes enclose fields only within a line.
+        rejoined: Option<u8>,
     },
     #[cfg(feature = "formats")]
     Parquet(parquet::ParquetRows),
@@ -92,6 +97,18 @@ pub struct Header {
     /// Units in a line of their own; empty = no such line.
     units: Vec<String>,
     has_decimal_comma: bool,
+}
+
+/// The first rows of a table.
+pub(super) struct FirstRows {
+    pub(super) header: Header,
+    records: Vec<csv::ByteRecord>,
+}
+
+impl FirstRows {
+    pub(super) fn rows(&self) -> impl Iterator<Item = Row<'_>> {
+        self.records.iter().map(|record| Row { line: 0, record, header: &self.header })
+    }
 }
 
 /// One row.
@@ -137,7 +154,8 @@ impl Table {
         let mut head = text::Head::read(source);
         let form = text::form(&head.bytes, score);
         let mut builder = csv::ReaderBuilder::new();
-        builder.quoting(quotes == Quotes::Enclose).flexible(true).trim(csv::Trim::All).has_headers(false);
+        let trim = if quotes == Quotes::Enclose { csv::Trim::All } else { csv::Trim::None };
+        builder.quoting(quotes == Quotes::Enclose).flexible(true).trim(trim).has_headers(false);
         builder.delimiter(form.separator);
         let before = &head.bytes[form.start.min(head.bytes.len())..];
         if !head.is_whole && memchr::memchr2(b'\n', b'\r', before).is_none() {
@@ -153,7 +171,11 @@ impl Table {
             lines_in(&head.bytes[..form.start.min(head.bytes.len())]) + names.position().map_or(1, csv::Position::line);
         let mut start = form.start + reader.position().byte() as usize;
         let mut units = csv::ByteRecord::new();
-        let has_units = matches!(reader.read_byte_record(&mut units), Ok(true)) && is_unit_row(&units);
+        let rejoined = (quotes == Quotes::Literal).then_some(form.separator);
+        rejoined.iter().for_each(|&separator| join_quoted(&mut names, separator));
+        let has_second = matches!(reader.read_byte_record(&mut units), Ok(true));
+        rejoined.iter().for_each(|&separator| join_quoted(&mut units, separator));
+        let has_units = has_second && is_unit_row(&units);
         if has_units {
             start = form.start + reader.position().byte() as usize;
         } else {
@@ -170,10 +192,15 @@ impl Table {
         let preview = Box::new(Cursor::new(data[..whole_rows].to_vec()));
         let open = |source: Box<dyn Read>| {
             let (source, since_row) = RowLimit::new(source);
-            let rows = Rows::Text { reader: builder.from_reader(source), since_row, lines_before };
-            Self { rows, record: csv::ByteRecord::new(), header: header.clone() }
+            let rows = Rows::Text { reader: builder.from_reader(source), since_row, lines_before, rejoined };
+            Self::of(rows, header.clone())
         };
         Ok((open(Box::new(Cursor::new(data).chain(head.rest))), open(preview)))
+    }
+
+    fn of(rows: Rows, header: Header) -> Self {
+        let [record, next] = [csv::ByteRecord::new(), csv::ByteRecord::new()];
+        Self { rows, record, next, ahead: None, header }
     }
 
     /// Opens a Parquet file, and the same file again for a look at its first rows.
@@ -187,7 +214,7 @@ impl Table {
             let names = names.iter().map(|name| escaped(name)).collect();
             let file = path.display().to_string();
             let header = Header { file, line: 1, names, units: Vec::new(), has_decimal_comma: false };
-            Ok(Self { rows: Rows::Parquet(rows), record: csv::ByteRecord::new(), header })
+            Ok(Self::of(Rows::Parquet(rows), header))
         };
         Ok((open()?, open()?))
     }
@@ -197,33 +224,73 @@ impl Table {
         &self.header
     }
 
+    /// Reads the first rows, at most `most`, up to the first fault.
+    pub(super) fn first_rows(mut self, most: usize) -> FirstRows {
+        let mut records = Vec::new();
+        while records.len() < most && matches!(self.next_row(), Ok(Some(_))) {
+            records.push(self.record.clone());
+        }
+        FirstRows { header: self.header, records }
+    }
+
     /// The next row; `None` at the end.
     ///
     /// # Errors
     /// Fails if the source fails, for example because a compressed file is damaged.
     pub fn next_row(&mut self) -> Result<Option<Row<'_>>, TableError> {
+        let Some(line) = self.ahead.take().unwrap_or_else(|| self.read())? else { return Ok(None) };
+        std::mem::swap(&mut self.record, &mut self.next);
+        Ok(Some(Row { line, record: &self.record, header: &self.header }))
+    }
+
+    /// The next row, and the row after it, if it can be read.
+    ///
+    /// # Errors
+    /// Fails like [`next_row`](Self::next_row).
+    pub(super) fn next_rows(&mut self) -> Result<Option<(Row<'_>, Option<Row<'_>>)>, TableError> {
+        let Some(line) = self.next_row()?.map(|row| row.line) else { return Ok(None) };
+        self.ahead = Some(self.read());
+        let row = |line, record| Row { line, record, header: &self.header };
+        let after = matches!(self.ahead, Some(Ok(Some(_)))).then(|| row(line + 1, &self.next));
+        Ok(Some((row(line, &self.record), after)))
+    }
+
+    /// Reads a row into `next`. Returns its line.
+    fn read(&mut self) -> Result<Option<u64>, TableError> {
         let (more, line) = match &mut self.rows {
-            Rows::Text { reader, since_row, lines_before } => {
+            Rows::Text { reader, since_row, lines_before, rejoined } => {
                 since_row.set(0);
-                let more = reader.read_byte_record(&mut self.record).map_err(|e| damaged(&self.header.file, &e))?;
-                (more, *lines_before + self.record.position().map_or(0, csv::Position::line))
+                let more = reader.read_byte_record(&mut self.next).map_err(|e| damaged(&self.header.file, &e))?;
+                let line = *lines_before + self.next.position().map_or(0, csv::Position::line);
+                rejoined.iter().for_each(|&separator| join_quoted(&mut self.next, separator));
+                (more, line)
             }
             #[cfg(feature = "formats")]
             Rows::Parquet(rows) => {
-                let more = rows.next(&mut self.record);
+                let more = rows.next(&mut self.next);
                 (
                     more.map_err(|what| TableError::Data(format!("{}: damaged: {what}", self.header.file)))?,
                     rows.number(),
                 )
             }
         };
-        Ok(more.then_some(Row { line, record: &self.record, header: &self.header }))
+        Ok(more.then_some(line))
     }
 }
 
 /// Whether the first bytes of a text contain a header line.
 pub(super) fn has_header(head: &[u8], score: &dyn Fn(&[String]) -> usize) -> bool {
     text::form(head, score).is_known
+}
+
+/// Joins the parts of quoted fields that hold separators, and removes blanks around fields. A quote without an end
+/// stays.
+fn join_quoted(record: &mut csv::ByteRecord, separator: u8) {
+    if record.iter().any(text::opens_quote) {
+        let parts: Vec<&[u8]> = record.iter().collect();
+        *record = text::join_quoted(&parts, separator).iter().collect();
+    }
+    record.trim();
 }
 
 /// Number of line feeds.
@@ -387,10 +454,13 @@ impl<'t> Row<'t> {
     }
 }
 
-/// Parses a field: `Some(None)` if the field is empty, `None` if it is not a finite number.
+/// Texts that programs write if there is no value, in lower case.
+const NO_VALUE: [&str; 10] = ["", "-", "--", "---", "nan", "n/a", "#n/a", "na", "null", "none"];
+
+/// Parses a field: `Some(None)` if the field has no value, `None` if it is not a finite number.
 pub(super) fn parse_field(field: &[u8]) -> Option<Option<f64>> {
-    let field = field.strip_prefix(b"\"").and_then(|field| field.strip_suffix(b"\"")).unwrap_or(field);
-    if field.is_empty() {
+    let field = field.strip_prefix(b"\"").and_then(|field| field.strip_suffix(b"\"")).unwrap_or(field).trim_ascii();
+    if NO_VALUE.iter().any(|text| field.eq_ignore_ascii_case(text.as_bytes())) {
         return Some(None);
     }
     let value: f64 = std::str::from_utf8(field).ok()?.parse().ok()?;
@@ -461,6 +531,10 @@ mod tests {
 
     #[test]
     fn literal_stray_quote_costs_one_row() {
+        let mut quoted = table("a,\"b, of c\",d\n\"x,y,\",\"2\",3\n", Quotes::Literal);
+        assert_eq!(quoted.header().names(), ["a", "b, of c", "d"]);
+        let row = quoted.next_row().expect("reads").expect("a row");
+        assert_eq!((row.number(1), row.number(2), row.line), (Ok(Some(2.0)), Ok(Some(3.0)), 2));
         let mut table = table("a,b\n1,\"2\n3,\"4\"\n", Quotes::Literal);
         assert!(table.next_row().expect("reads").expect("a row").number(1).is_err());
         assert_eq!(table.next_row().expect("reads").expect("a row").number(1), Ok(Some(4.0)));

@@ -20,6 +20,19 @@ pub enum Quantity {
     Share,
 }
 
+impl Quantity {
+    /// The role of a column with this quantity.
+    pub(super) const fn name(self) -> &'static str {
+        match self {
+            Self::Time => "time",
+            Self::Current => "current",
+            Self::Voltage => "voltage",
+            Self::Temperature => "temperature",
+            Self::Charge | Self::Share => "another column",
+        }
+    }
+}
+
 /// A unit of a quantity.
 #[derive(Debug, PartialEq)]
 pub struct Unit {
@@ -46,7 +59,7 @@ const fn unit(
 }
 
 /// All units. The first unit of each quantity is its base unit.
-const UNITS: [Unit; 21] = [
+const UNITS: [Unit; 22] = [
     unit(Quantity::Time, "s", 1.0, 1.0, &["s", "sec", "secs", "second", "seconds"]),
     unit(Quantity::Time, "ms", 1.0, 1e3, &["ms", "msec", "millisecond", "milliseconds"]),
     unit(Quantity::Time, "us", 1.0, 1e6, &["us", "usec", "microsecond", "microseconds"]),
@@ -54,13 +67,21 @@ const UNITS: [Unit; 21] = [
     unit(Quantity::Time, "min", 60.0, 1.0, &["min", "mins", "minute", "minutes"]),
     unit(Quantity::Time, "h", 3600.0, 1.0, &["h", "hr", "hrs", "hour", "hours"]),
     unit(Quantity::Time, "d", 86_400.0, 1.0, &["d", "day", "days"]),
+    Unit {
+        quantity: Quantity::Time,
+        symbol: "Excel days",
+        zero: 25_569.0,
+        multiply: 86_400.0,
+        divide: 1.0,
+        spellings: &["exceldays"],
+    },
     unit(Quantity::Current, "A", 1.0, 1.0, &["a", "amp", "amps", "ampere", "amperes"]),
     unit(Quantity::Current, "mA", 1.0, 1e3, &["ma", "mamp", "mamps", "milliamp", "milliamps", "milliampere"]),
     unit(Quantity::Current, "uA", 1.0, 1e6, &["ua", "microamp", "microampere"]),
     unit(Quantity::Voltage, "V", 1.0, 1.0, &["v", "volt", "volts"]),
     unit(Quantity::Voltage, "mV", 1.0, 1e3, &["mv", "millivolt", "millivolts"]),
     unit(Quantity::Voltage, "uV", 1.0, 1e6, &["uv", "microvolt"]),
-    unit(Quantity::Temperature, "degC", 1.0, 1.0, &["c", "degc", "celsius", "deg_c", "degreec", "degreesc"]),
+    unit(Quantity::Temperature, "degC", 1.0, 1.0, &["c", "oc", "degc", "celsius", "deg_c", "degreec", "degreesc"]),
     Unit {
         quantity: Quantity::Temperature,
         symbol: "K",
@@ -88,6 +109,7 @@ impl Unit {
     /// Finds the unit that `text` names.
     pub fn find(text: &str) -> Option<&'static Self> {
         let mut plain: String = text.trim().to_lowercase().replace(['\u{b5}', '\u{3bc}'], "u");
+        plain = plain.replace('\u{2103}', "c").replace('\u{2109}', "f");
         plain.retain(|c| !matches!(c, ' ' | '.' | '\u{b7}' | '*' | '^'));
         // The sign of a degree in UTF-8, as ordinal, and as a byte of another encoding.
         for (sign, ends) in [('\u{b0}', ""), ('\u{ba}', ""), ('\u{f8}', ""), ('\u{fffd}', "cfk")] {
@@ -117,9 +139,9 @@ impl Unit {
         self.divide / self.multiply
     }
 
-    /// Length of this unit of time (ns); `None` for another quantity.
+    /// Length of this unit of time (ns); `None` for another quantity, and for Excel's days, which do not begin in 1970.
     pub(super) fn nanos(&self) -> Option<i64> {
-        (self.quantity == Quantity::Time).then_some((1e9 * self.multiply / self.divide) as i64)
+        (self.quantity == Quantity::Time && self.zero == 0.0).then_some((1e9 * self.multiply / self.divide) as i64)
     }
 }
 
@@ -142,6 +164,9 @@ mod tests {
             ("min", 2.0, 120.0),
             ("\u{b0}F", 77.0, 25.0),
             ("K", 298.15, 25.0),
+            ("\u{2103}", 25.0, 25.0),
+            ("\u{2109}", 77.0, 25.0),
+            ("Excel days", 45_244.0, 1_700_000_000.0 - 80_000.0),
             ("\u{fffd}C", 25.0, 25.0),
             ("\u{b5}s", 5e6, 5.0),
             ("mA.h", 500.0, 0.5),

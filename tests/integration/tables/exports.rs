@@ -87,6 +87,7 @@ pub(super) fn all(rows: &[Sample]) -> Vec<Export> {
     all.extend(magnitudes(rows));
     all.extend(programs(rows));
     all.extend(forms(rows));
+    all.extend(headers(rows));
     all
 }
 
@@ -390,4 +391,90 @@ fn forms(rows: &[Sample]) -> Vec<Export> {
             ),
         ),
     ]
+}
+
+/// Headers whose columns need a choice, and rows that need a decision.
+fn headers(rows: &[Sample]) -> Vec<Export> {
+    type Row<'a> = (&'static str, &'static str, &'a str, bool, &'a dyn Fn(Sample) -> String);
+    let (a, v) = (|s: Sample| ampere(s.current_ma), volt);
+    let charged = |s: Sample| ampere(-s.current_ma);
+    let magnitude =
+        |s: Sample, words| format!("{},{},{},{}", s.second, ampere(s.current_ma.abs()), v(s), state(s, words));
+    let day = |s: Sample| format!("14-Nov-2023 22:{:02}:{:02}.000", 13 + s.second / 60, s.second % 60);
+    let all: [Row<'_>; 14] = [
+        (
+            "Landt",
+            "1.csv",
+            "Record,TestTime,StepTime,Current/mA,Capacity/mAh,Voltage/V,Temperature/\u{2103},SysTime",
+            true,
+            &|s| {
+                format!("1,{},{},{},0,{},25,2023-11-14 22:13:20", clock(s.second), clock(s.second), -s.current_ma, v(s))
+            },
+        ),
+        (
+            "PEC",
+            "2.csv",
+            "Test,Cell,Cycle,Step,Total Time (Seconds),Step Time (Seconds),Voltage (mV),Current (mA)",
+            false,
+            &|s| format!("1,1,1,2,{0},{0},{1},{2}", s.second, s.voltage_mv, -s.current_ma),
+        ),
+        (
+            "Novonix",
+            "3.csv",
+            "[Data]\nDate and Time,Cycle Number,Step Type,Run Time (h),Current (A),Potential (V),Temperature (\u{b0}C)",
+            true,
+            &|s| format!("2023-11-14 22:13:20,0,2,{:.9},{},{},25", f64::from(s.second) / 3600.0, charged(s), v(s)),
+        ),
+        (
+            "Torque",
+            "4.csv",
+            "GPS Time,Device Time, Longitude,HV Battery Current(A),HV Battery Voltage(V)",
+            false,
+            &|s| format!("-,{},-,{},{}", day(s), a(s), v(s)),
+        ),
+        ("VESC", "5.csv", "ms_today;input_voltage;temp_mos_max;current_motor;current_in", false, &|s| {
+            format!("{};{};40;{};{}", 80_000_000 + 1000 * s.second, v(s), 3 * s.current_ma, a(s))
+        }),
+        (
+            "Neware in Chinese",
+            "6.csv",
+            "\u{6570}\u{636e}\u{5e8f}\u{53f7},\u{603b}\u{65f6}\u{95f4},\u{7535}\u{6d41}(mA),\u{7535}\u{538b}(V)",
+            false,
+            &|s| format!("1,{},{},{}", clock(s.second), s.current_ma, v(s)),
+        ),
+        ("quoted separators", "7.csv", "\"Note, n\",Time (s),Current (A),Voltage (V)", false, &|s| {
+            format!("\"a, b\",{},\"{}\",{}", s.second, a(s), v(s))
+        }),
+        ("Excel days", "8.csv", "Date,Current (A),Voltage (V)", false, &|s| {
+            format!("{:.10},{},{}", 45_000.5 + f64::from(s.second) / 86_400.0, a(s), v(s))
+        }),
+        ("ms without a unit", "9.csv", "time,current,voltage", false, &|s| {
+            format!("{},{},{}", 1000 * s.second, a(s), v(s))
+        }),
+        ("T next to a time", "10.csv", "T,Time,Current,Voltage", true, &|s| {
+            format!("25,{},{},{}", s.second, a(s), v(s))
+        }),
+        ("texts for no value", "11.csv", "Time (s),Current (A),Voltage (V),Temp (C)", false, &|s| {
+            format!(
+                "{},{},{}{}",
+                s.second,
+                a(s),
+                v(s),
+                [",-", ",NaN", ",n/a", ",null", ",#N/A", ",", ""][s.second as usize % 7]
+            )
+        }),
+        ("states in French", "12.csv", "Time (s),Current (A),Voltage (V),State", false, &|s| {
+            magnitude(s, ["D\u{e9}charge", "Charge", "Repos"])
+        }),
+        ("states in German", "13.csv", "Time (s),Current (A),Voltage (V),State", false, &|s| {
+            magnitude(s, ["Entladen", "Laden", "Not charging"])
+        }),
+        ("states as numbers", "14.csv", "Time (s),Current (A),Voltage (V),State", false, &|s| {
+            magnitude(s, ["1", "0", "0"])
+        }),
+    ];
+    all.map(|(name, file, head, has_temperature, row)| {
+        export(name, file, has_temperature, table(head, rows, row, "\n"))
+    })
+    .into()
 }

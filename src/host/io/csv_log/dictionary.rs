@@ -41,227 +41,80 @@ pub(super) enum Role {
     Soc,
 }
 
-/// Names of each role. Earlier lines are preferred to later ones; a column of a later line is used only if the file has
+/// Names of each role, divided by bars. Earlier lines are preferred to later ones; a column of a later line is used only if the file has
 /// no column of an earlier line.
-const NAMES: [(Role, &[&str]); 19] = [
+const NAMES: [(Role, &str); 19] = [
+    (Role::Time, "test time|total time|testtime|totaltime|prog time|program time|program duration|test"),
     (
         Role::Time,
-        &["test time", "total time", "testtime", "totaltime", "prog time", "program time", "program duration", "test"],
+        "time|elapsed time|elapsed|run time|runtime|rel time|t|time since start|seconds|minutes|hours|millis|\
+         milliseconds|test duration|ms today|zeit|gesamtzeit|programmdauer",
     ),
-    (
-        Role::Time,
-        &[
-            "time",
-            "elapsed time",
-            "elapsed",
-            "run time",
-            "runtime",
-            "rel time",
-            "t",
-            "time since start",
-            "seconds",
-            "minutes",
-            "hours",
-            "millis",
-            "milliseconds",
-            "test duration",
-        ],
-    ),
-    (
-        Role::Time,
-        &["epoch time", "epoch", "unix time", "unixtime", "unix timestamp", "unix", "timestamp", "time stamp", "ts"],
-    ),
+    (Role::Time, "epoch time|epoch|unix time|unixtime|unix timestamp|unix|timestamp|time stamp|ts"),
     (
         Role::Date,
-        &[
-            "date time",
-            "datetime",
-            "date",
-            "absolute time",
-            "dpt time",
-            "dpt",
-            "system time",
-            "utc time",
-            "local time",
-            "date time iso",
-            "realtime",
-            "device time",
-            "gps time",
-            "date and time",
-            "recorded at",
-            "gmtime",
-        ],
+        "date time|datetime|date|absolute time|dpt time|dpt|system time|utc time|local time|date time iso|\
+         realtime|device time|gps time|date and time|recorded at|zeitstempel|\
+         \u{7edd}\u{5bf9}\u{65f6}\u{95f4}|gmtime",
     ),
-    (Role::StepTime, &["relative time", "step time", "steptime", "t step", "step duration", "state time"]),
+    (Role::StepTime, "relative time|step time|steptime|t step|step duration|state time"),
     (
         Role::Current,
-        &[
-            "current",
-            "amps",
-            "amp",
-            "amperes",
-            "i",
-            "cur",
-            "pack current",
-            "battery current",
-            "batt current",
-            "bat current",
-            "pack amps",
-            "cell current",
-            "current measured",
-            "measured current",
-            "load current",
-            "mamps",
-            "hv battery current",
-            "bms current",
-            "battery amps",
-            "battery",
-            "batt",
-            "bat",
-            "pack",
-        ],
+        "current|amps|amp|amperes|i|cur|pack current|battery current|batt current|bat current|pack amps|\
+         cell current|current measured|measured current|load current|mamps|hv battery current|bms current|\
+         bms battery current|current in|strom|\u{7535}\u{6d41}|battery amps|battery|batt|bat|pack",
     ),
     (
         Role::Voltage,
-        &[
-            "voltage",
-            "volts",
-            "volt",
-            "u",
-            "v",
-            "ecell",
-            "cell voltage",
-            "voltage measured",
-            "measured voltage",
-            "potential",
-            "terminal voltage",
-            "vol",
-        ],
+        "voltage|volts|volt|u|v|ecell|cell voltage|voltage measured|measured voltage|potential|\
+         terminal voltage|vol|spannung|\u{7535}\u{538b}",
     ),
     (
         Role::Voltage,
-        &[
-            "pack voltage",
-            "pack volts",
-            "battery voltage",
-            "batt voltage",
-            "bat voltage",
-            "total voltage",
-            "hv battery voltage",
-            "bms voltage",
-            "battery volts",
-            "ewe",
-            "battery terminal voltage",
-            "battery",
-            "batt",
-            "bat",
-            "pack",
-        ],
+        "pack voltage|pack volts|battery voltage|batt voltage|bat voltage|total voltage|hv battery voltage|\
+         bms voltage|bms battery voltage|input voltage|pack inst voltage|battery volts|ewe|\
+         battery terminal voltage|battery|batt|bat|pack",
     ),
     (
         Role::CellVoltage,
-        &[
-            "v",
-            "u",
-            "cell",
-            "cell voltage",
-            "voltage",
-            "voltage cell",
-            "cell v",
-            "v cell",
-            "u cell",
-            "cell u",
-            "cp",
-            "cellvoltage",
-            "cell volt",
-            "cell volts",
-            "cellv",
-            "vcell",
-            "ucell",
-            "volt",
-            "volts",
-            "c",
-            "cell pair",
-        ],
+        "v|u|cell|cell voltage|voltage|voltage cell|cell v|v cell|u cell|cell u|cp|cellvoltage|cell volt|\
+         cell volts|cellv|vcell|ucell|volt|volts|c|cell pair",
     ),
     (
         Role::Temperature,
-        &[
-            "temperature",
-            "temp",
-            "cell temperature",
-            "cell temp",
-            "surface temperature",
-            "surface temperature t",
-            "surface temp",
-            "temperature t",
-            "temperature cell",
-            "temp cell",
-            "t cell",
-            "aux temperature",
-            "evtemp",
-            "ev temp",
-            "logtemp",
-            "x averaged cell temperature",
-            "volume averaged cell temperature",
-            "temperature measured",
-            "cell t",
-        ],
+        "temperature|temp|cell temperature|cell temp|surface temperature|surface temperature t|surface temp|\
+         temperature t|temperature cell|temp cell|t cell|aux temperature|evtemp|ev temp|logtemp|\
+         x averaged cell temperature|volume averaged cell temperature|temperature measured|cell t|\
+         cell temp mid|temperatur|\u{6e29}\u{5ea6}",
     ),
     (
         Role::Temperature,
-        &[
-            "battery temperature",
-            "battery temp",
-            "batt temp",
-            "bat temp",
-            "pack temperature",
-            "pack temp",
-            "pack t",
-            "module temperature",
-            "module temp",
-            "t",
-            "temp sensor",
-            "temperature sensor",
-            "ntc",
-        ],
+        "battery temperature|battery temp|batt temp|bat temp|hv battery temperature|hv battery temp|\
+         bms battery temperature|pack temperature|pack temp|pack t|module temperature|module temp|t|\
+         temp sensor|temperature sensor|ntc",
     ),
-    (
-        Role::Temperature,
-        &["ambient temperature", "ambient temp", "tenv", "environment temperature", "chamber temperature"],
-    ),
-    (Role::Step, &["step", "step index", "stepindex", "step id", "step number", "ns", "line", "steps"]),
+    (Role::Temperature, "ambient temperature|ambient temp|tenv|environment temperature|chamber temperature"),
+    (Role::Step, "step|step index|stepindex|step id|step number|ns|line|steps"),
     (
         Role::State,
-        &[
-            "state",
-            "status",
-            "step type",
-            "steptype",
-            "step name",
-            "md",
-            "mode",
-            "charge state",
-            "charging state",
-            "charge status",
-            "command",
-            "work mode",
-            "direction",
-        ],
+        "state|status|step type|steptype|step name|md|mode|charge state|charging state|charge status|command|\
+         work mode|direction|charging|charging status|charge discharge|battery status|battery state|\
+         bms state|zustand|\u{5de5}\u{6b65}\u{7c7b}\u{578b}",
     ),
-    (Role::Discharged, &["discharged"]),
-    (Role::NetCharged, &["net capacity", "ahbal"]),
-    (Role::Soc, &["soc", "state of charge"]),
+    (Role::Discharged, "discharged"),
+    (Role::NetCharged, "net capacity|ahbal"),
+    (Role::Soc, "soc|state of charge"),
     // Chinese names of Neware and Landt.
-    (Role::Time, &["\u{603b}\u{65f6}\u{95f4}", "\u{6d4b}\u{8bd5}\u{65f6}\u{95f4}"]),
-    (Role::StepTime, &["\u{65f6}\u{95f4}"]),
+    (Role::Time, "\u{603b}\u{65f6}\u{95f4}|\u{6d4b}\u{8bd5}\u{65f6}\u{95f4}"),
+    (Role::StepTime, "\u{65f6}\u{95f4}"),
 ];
 
 /// Words for the battery.
 const BATTERY: [&str; 4] = ["battery", "batt", "bat", "pack"];
 
 /// Names that contain their unit as a word.
-const UNITS_AS_NAMES: [(&str, &str); 11] = [
+const UNITS_AS_NAMES: [(&str, &str); 12] = [
+    ("ms today", "ms"),
     ("seconds", "s"),
     ("minutes", "min"),
     ("hours", "h"),
@@ -303,6 +156,9 @@ impl Role {
 
 /// The roles that a column may have.
 pub(super) fn known(name: &str, unit: &str) -> Vec<Known> {
+    if !unit.is_empty() && unknown_unit(name, unit).is_some() {
+        return Vec::new();
+    }
     let name = ColumnName::parse(name, unit);
     let found = lookup(&name);
     if !found.is_empty() {
@@ -311,11 +167,21 @@ pub(super) fn known(name: &str, unit: &str) -> Vec<Known> {
     name.with_last_word_as_unit().map_or_else(Vec::new, |name| lookup(&name))
 }
 
+/// The role and the unit of a column whose unit is unknown: in the line of units, in brackets or after a slash.
+pub(super) fn unknown_unit(name: &str, unit: &str) -> Option<(Role, String)> {
+    let trimmed = |text: &str| text.trim_matches(['(', '[', '{', ')', ']', '}', ' ']).to_owned();
+    let (words, text) = if trimmed(unit).is_empty() { name.rsplit_once(['(', '[', '{', '/'])? } else { (name, unit) };
+    let text = trimmed(text);
+    let role = lookup(&ColumnName::parse(words, "")).first()?.role;
+    let is_unknown = !text.is_empty() && text.chars().all(char::is_alphabetic) && Unit::find(&text).is_none();
+    (is_unknown && role != Role::Date && role.quantity().is_some()).then_some((role, text))
+}
+
 fn lookup(name: &ColumnName) -> Vec<Known> {
     let as_word = || {
         UNITS_AS_NAMES
             .iter()
-            .find(|(word, _)| name.words.rsplit(' ').next() == Some(*word))
+            .find(|(word, _)| name.words == *word || name.words.rsplit(' ').next() == Some(*word))
             .and_then(|of| Unit::find(of.1))
     };
     let unit = name.unit.or_else(as_word);
@@ -331,14 +197,16 @@ fn lookup(name: &ColumnName) -> Vec<Known> {
             Role::Current | Role::Voltage if BATTERY.contains(&name.words.as_str()) => {
                 name.number.is_none() && unit.is_some()
             }
-            Role::Temperature => name.words != "t" || name.number.is_some() || unit.is_some(),
             Role::Time if name.words == "test" => unit.is_some() || name.is_clock,
+            Role::Temperature => true,
             _ => name.number.is_none(),
         };
         quantity_fits && number_fits && (!name.is_clock || role.quantity() == Some(Quantity::Time))
     };
-    let named =
-        NAMES.iter().enumerate().filter(|(_, (role, names))| names.contains(&name.words.as_str()) && fits(*role));
+    let named = NAMES
+        .iter()
+        .enumerate()
+        .filter(|(_, (role, names))| names.split('|').any(|of| of == name.words) && fits(*role));
     named.map(|(rank, &(role, _))| Known { role, rank, unit, number: name.number }).collect()
 }
 

@@ -7,58 +7,12 @@
 use super::CsvOptions;
 use super::dictionary::Format;
 use super::layout::{Column, Layout};
+use super::state::{CurrentSign, Direction, SignSource, direction};
 use super::time_text::{TimeForm, TimeText};
 use crate::can::decode::Channel;
 use crate::io::plausible::{self, Implausible, PackSize, ShownSign, median};
-use crate::io::table::{Header, Row, Table, TableError};
+use crate::io::table::{FirstRows, Header, Row, TableError};
 use crate::io::units::Unit;
-
-/// Largest number of rows that are judged.
-const MAX_ROWS: usize = 50_000;
-
-/// Direction of the current in a row, according to the state column.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Direction {
-    Charge,
-    Discharge,
-}
-
-/// Reads the direction from a state such as `D`, `CC_DChg`, `CHA`, `Discharging` or `Rest` (`None`).
-pub(super) fn direction(state: &[u8]) -> Option<Direction> {
-    let text = String::from_utf8_lossy(state).to_lowercase();
-    let text = text.trim().trim_matches('"');
-    let has = |words: &[&str]| words.iter().any(|word| text.contains(word));
-    if text == "d" || text == "dis" || has(&["dch", "dischg", "discharg", "dis-charg", "entlad", "\u{653e}\u{7535}"]) {
-        Some(Direction::Discharge)
-    } else if text == "c"
-        || has(&["chg", "cha", "charg", "chrg", "regen", "\u{5145}\u{7535}"]) && !has(&["change", "channel"])
-    {
-        Some(Direction::Charge)
-    } else {
-        None
-    }
-}
-
-/// What decides the sign of the current.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum SignSource {
-    User,
-    Format,
-    State,
-    Voltage,
-    Nothing,
-}
-
-/// Sign of the current.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct CurrentSign {
-    pub(super) is_charge_positive: bool,
-    /// Whether the current is a magnitude whose sign the state column gives.
-    pub(super) is_by_state: bool,
-    /// Whether a positive current in a discharge has shown that it is a magnitude.
-    pub(super) is_magnitude_shown: bool,
-    pub(super) source: SignSource,
-}
 
 /// The result.
 #[derive(Debug)]
@@ -82,6 +36,7 @@ struct Samples {
     /// Voltage of a cell.
     voltages: Vec<f64>,
     temperatures: Vec<Vec<f64>>,
+    states: Vec<Vec<u8>>,
     directions: Vec<Option<Direction>>,
     discharged: Vec<f64>,
     socs: Vec<f64>,
@@ -89,14 +44,9 @@ struct Samples {
 }
 
 impl Samples {
-    fn read(preview: &mut Table, layout: &Layout) -> Self {
+    fn read(first: &FirstRows, layout: &Layout) -> Self {
         let mut samples = Self::default();
-        while let Ok(Some(row)) = preview.next_row() {
-            if samples.currents.len() >= MAX_ROWS {
-                break;
-            }
-            samples.add(&row, layout);
-        }
+        first.rows().for_each(|row| samples.add(&row, layout));
         samples
     }
 
@@ -124,21 +74,25 @@ impl Samples {
                 _ => {}
             }
         }
-        self.directions.push(layout.state.and_then(|column| row.bytes(column)).and_then(direction));
+        let state = layout.state.and_then(|column| row.bytes(column)).unwrap_or_default();
+        self.states.push(state.to_vec());
+        self.directions.push(direction(state));
         self.discharged.push(layout.discharged.as_ref().map_or(f64::NAN, |(column, factor)| factor * value(column)));
         self.sections.extend(layout.section.map(|column| row.bytes(column).unwrap_or_default().to_vec()));
     }
 }
 
 /// Judges the first rows, and completes the units of `layout`.
-pub(super) fn judge(preview: &mut Table, layout: &mut Layout, options: &CsvOptions) -> Result<Judgement, TableError> {
-    let header = preview.header().clone();
-    let mut samples = Samples::read(preview, layout);
+pub(super) fn judge(first: &FirstRows, layout: &mut Layout, options: &CsvOptions) -> Result<Judgement, TableError> {
+    let mut samples = Samples::read(first, layout);
     if options.pack_total {
         samples.voltages.iter_mut().for_each(|v| *v /= f64::from(options.series.max(1)));
     }
-    Judge { header: &header, options, samples, notes: Vec::new() }.run(layout)
+    Judge { header: &first.header, options, samples, notes: std::mem::take(&mut layout.notes) }.run(layout)
 }
+
+/// Largest number of states as numbers.
+const MAX_CODES: usize = 8;
 
 struct Judge<'a> {
     header: &'a Header,
@@ -151,16 +105,17 @@ impl Judge<'_> {
     fn run(mut self, layout: &mut Layout) -> Result<Judgement, TableError> {
         self.voltage_unit(layout)?;
         self.current_unit(layout)?;
-        self.temperature_units(layout)?;
+        self.temperature_units(layout);
         self.soc_unit(layout);
         let (time, time_form, is_time_assumed, times) = self.times(layout)?;
         self.keep_section(layout, &times);
         let sign = self.sign(layout, &times)?;
-        let mut trial = sign;
-        let signed = |(&current, direction): (&f64, &Option<Direction>)| {
-            trial.discharge(current, *direction).unwrap_or(f64::NAN)
+        let mut trial = sign.clone();
+        let signed = |(&current, state): (&f64, &Vec<u8>)| {
+            let direction = trial.direction(state);
+            trial.discharge(current, direction).unwrap_or(f64::NAN)
         };
-        let currents: Vec<f64> = self.samples.currents.iter().zip(&self.samples.directions).map(signed).collect();
+        let currents: Vec<f64> = self.samples.currents.iter().zip(&self.samples.states).map(signed).collect();
         if layout.section.is_none() {
             let size = PackSize { capacity_ah: self.options.capacity_ah };
             let response = plausible::check_response(&times, &currents, &self.samples.voltages, size);
@@ -233,28 +188,30 @@ impl Judge<'_> {
         Ok(())
     }
 
-    /// Finds kelvin; a temperature of 200 degrees Celsius is none.
-    fn temperature_units(&mut self, layout: &mut Layout) -> Result<(), TableError> {
-        let columns = layout.channels.iter_mut().filter(|(channel, _)| matches!(channel, Channel::Temperature(_)));
-        for ((_, column), values) in columns.zip(&self.samples.temperatures) {
-            let Some(median) = median(values) else { continue };
+    /// Finds kelvin, and leaves out columns of impossible temperatures.
+    fn temperature_units(&mut self, layout: &mut Layout) {
+        let mut medians = self.samples.temperatures.iter().map(|values| median(values));
+        layout.channels.retain_mut(|(channel, column)| {
+            let is_temperature = matches!(channel, Channel::Temperature(_));
+            let Some(median) = is_temperature.then(|| medians.next().flatten()).flatten() else { return true };
             let name = &self.header.names()[column.index];
-            match (column.is_stated, median) {
+            let note = match (column.is_stated, median) {
                 (false, 200.0..400.0) => {
                     column.unit = Unit::find("K").unwrap_or(column.unit);
-                    self.notes.push(format!("column {name} has no unit and is in K by its size"));
+                    format!("column {name} has no unit and is in K by its size")
                 }
                 (_, 150.0..) | (_, ..-100.0) => {
-                    return Err(self.header.fault(format_args!(
-                        "column {name}: {median} degrees C is impossible; write the unit (K or F) into the header, or \
-                         use --column temperature='{name}[K]'"
-                    )));
+                    let remedy =
+                        format!("write the unit (K or F) into the header, or use --column temperature='{name}[K]'");
+                    self.notes.push(format!("column {name} is left out: {median} degrees C is impossible; {remedy}"));
+                    return false;
                 }
-                (false, 60.0..) => self.notes.push(format!("column {name} has no unit, degrees C are assumed")),
-                _ => {}
-            }
-        }
-        Ok(())
+                (false, 60.0..) => format!("column {name} has no unit, degrees C are assumed"),
+                _ => return true,
+            };
+            self.notes.push(note);
+            true
+        });
     }
 
     /// Finds the unit of a reported SOC; a column that fits none is left out.
@@ -279,7 +236,9 @@ impl Judge<'_> {
 
     /// Finds form and unit of the times. Returns the times of the rows (s), too.
     fn times(&mut self, layout: &Layout) -> Result<(TimeText, TimeForm, bool, Vec<f64>), TableError> {
-        let form = self.samples.time_texts.first().map_or(TimeForm::Number, |text| TimeText::form(text));
+        let texts = &self.samples.time_texts;
+        let first = texts.iter().find(|text| text.contains(|c: char| c.is_ascii_digit()));
+        let form = first.map_or(TimeForm::Number, |text| TimeText::form(text));
         let (mut unit, mut is_assumed) = (layout.time.unit, false);
         if form == TimeForm::Number && !layout.time.is_stated {
             (unit, is_assumed) = self.unstated_time_unit(layout);
@@ -300,7 +259,7 @@ impl Judge<'_> {
             plausible::check_order(&times).map_err(|of| self.fault(layout, &of))?;
         }
         if form == TimeForm::Number && layout.time.is_stated && unit.per_base() == 1.0 {
-            self.note_other_grid(layout, &times);
+            self.note_other_unit(layout, &times);
         }
         Ok((reader, form, is_assumed, times))
     }
@@ -310,15 +269,10 @@ impl Judge<'_> {
         if form != TimeForm::Date {
             return false;
         }
-        let parts = |text: &String| {
-            let mut numbers = text.split(['/', '-', ' ']).map(|part| part.parse::<u32>().unwrap_or(0));
-            (numbers.next().unwrap_or(0), numbers.next().unwrap_or(0))
-        };
-        let texts = &self.samples.time_texts;
-        let is_day_first = texts.iter().any(|text| (13..=31).contains(&parts(text).0));
-        let is_open = texts.iter().all(|text| (1..13).contains(&parts(text).0) && (1..13).contains(&parts(text).1));
-        if is_open && texts.first().is_some_and(|text| text.contains('/')) {
-            self.notes.push("dates are read as month/day/year".to_owned());
+        let (is_day_first, is_open) = TimeText::is_day_first(&self.samples.time_texts);
+        if is_open {
+            let order = if is_day_first { "day/month/year, which is the shorter record" } else { "month/day/year" };
+            self.notes.push(format!("dates are read as {order}"));
         }
         is_day_first
     }
@@ -327,50 +281,79 @@ impl Judge<'_> {
     fn unstated_time_unit(&self, layout: &Layout) -> (&'static Unit, bool) {
         let raw = &self.samples.raw_times;
         let find = |symbol: &str| Unit::find(symbol).unwrap_or(layout.time.unit);
-        if let Some(unit) = raw.first().and_then(|&first| plausible::probable_stamp_unit(first)) {
+        let first = raw.iter().copied().find(|time| time.is_finite());
+        if let Some(unit) = first.and_then(plausible::probable_stamp_unit) {
             return (find(unit), false);
         }
-        let (Some(first), true) = (raw.first(), raw.len() > 2) else { return (layout.time.unit, true) };
-        if *first > 1e8 {
+        let (Some(first), true) = (first, raw.len() > 2) else { return (layout.time.unit, true) };
+        if first > 1e8 {
             // Seconds since 1970.
             return (layout.time.unit, false);
         }
-        let seconds = layout.time.unit;
-        for symbol in ["s", "min", "h", "ms"] {
-            if self.charge_ratio(raw, find(symbol)).is_some_and(|ratio| (0.9..1.1).contains(&ratio)) {
-                return (find(symbol), false);
-            }
+        let step = plausible::median_step(raw).unwrap_or_default();
+        // From 1970 to 2100, with rows at most some minutes apart; as seconds, they would be less than 4 ms apart.
+        if (25_569.0..73_051.0).contains(&first) && step < 0.004 {
+            return (find("Excel days"), true);
         }
-        (grid_unit(raw).map_or(seconds, find), true)
+        let by_charge = ["s", "min", "h", "ms", "us"]
+            .into_iter()
+            .find(|symbol| self.charge_ratio(raw, find(symbol)).is_some_and(|ratio| (0.9..1.1).contains(&ratio)));
+        if let Some(symbol) = by_charge {
+            return (find(symbol), false);
+        }
+        // Rows are rarely ten minutes or less than 5 ms apart.
+        let usual = if step >= 500.0 { ["ms", "us", "ns", "s"] } else { ["s", "ms", "min", "h"] };
+        let is_usual = |symbol: &&str| find(symbol).convert(step) >= 0.005 || step <= 0.0;
+        let mut candidates = grid_unit(raw).into_iter().chain(usual.into_iter().filter(is_usual)).chain(["s"]);
+        let unit = candidates.find(|symbol| self.is_possible_time_unit(raw, find(symbol)));
+        (unit.map_or(layout.time.unit, find), true)
     }
 
-    /// The charge of the currents over the charge that a column of the table states, if the times are in `unit`.
+    /// Whether currents and voltages allow that the times are in `unit`.
+    fn is_possible_time_unit(&self, raw: &[f64], unit: &Unit) -> bool {
+        let Some(capacity_ah) = self.options.capacity_ah else { return true };
+        let times: Vec<f64> = raw.iter().map(|&time| unit.convert(time)).collect();
+        let Samples { currents, voltages, .. } = &self.samples;
+        plausible::check_charge(&times, currents, capacity_ah).is_ok()
+            && plausible::check_slope(&times, currents, voltages, capacity_ah).is_ok()
+    }
+
+    /// The charge of the currents over the charge that a column of the table states, if the times are in `unit`. Gaps
+    /// and small currents, which may be an offset, do not count, nor do rows in which the column begins anew.
     fn charge_ratio(&self, raw_times: &[f64], unit: &Unit) -> Option<f64> {
-        let stated = &self.samples.discharged;
-        let span =
-            stated.iter().filter(|q| q.is_finite()).fold((f64::MAX, f64::MIN), |(l, h), &q| (l.min(q), h.max(q)));
-        let mut charge = 0.0_f64;
-        let (mut low, mut high) = (0.0_f64, 0.0_f64);
-        for (pair, current) in raw_times.windows(2).zip(&self.samples.currents) {
-            let step_s = unit.convert(pair[1]) - unit.convert(pair[0]);
-            if step_s > 0.0 && current.is_finite() {
-                charge += current * step_s / 3600.0;
-                (low, high) = (low.min(charge), high.max(charge));
+        let Samples { currents, discharged, .. } = &self.samples;
+        let longest = plausible::longest_step(raw_times);
+        let smallest = 0.05 * currents.iter().copied().filter(|i| i.is_finite()).fold(0.0, |max, i| i.abs().max(max));
+        // Charge of the currents and of the column, for each direction of a positive current.
+        let mut sums = [(0.0, 0.0); 2];
+        for (n, step) in raw_times.windows(2).enumerate().map(|(n, pair)| (n, pair[1] - pair[0])) {
+            let (current, change) = (currents[n], discharged[n + 1] - discharged[n]);
+            if (0.0..=longest).contains(&step) && current.abs() >= smallest && change.is_finite() {
+                let charge = current.abs() * unit.convert(step) / 3600.0;
+                for (sum, _) in sums.iter_mut().zip([1.0, -1.0]).filter(|(_, sign)| sign * current * change >= 0.0) {
+                    *sum = (sum.0 + charge, sum.1 + change.abs());
+                }
             }
         }
-        let stated_ah = span.1 - span.0;
-        (stated_ah > 0.0 && high > low).then(|| (high - low) / stated_ah)
+        let (charge, stated) = if sums[0].1 > sums[1].1 { sums[0] } else { sums[1] };
+        (charge > 0.0 && stated > 0.0).then(|| charge / stated)
     }
 
-    /// Notes times that are stated in seconds but advance as minutes or hours do.
-    fn note_other_grid(&mut self, layout: &Layout, times: &[f64]) {
-        if let Some(unit) = grid_unit(times) {
-            let name = &self.header.names()[layout.time.index];
-            self.notes.push(format!(
-                "column {name} advances like {unit}, but is read in s; if it is in {unit}, use --column \
-                 time='{name}[{unit}]'"
-            ));
-        }
+    /// Notes times that are stated in seconds but advance as minutes or hours do, or are too short for the voltages.
+    fn note_other_unit(&mut self, layout: &Layout, times: &[f64]) {
+        let name = &self.header.names()[layout.time.index];
+        let Samples { currents, voltages, .. } = &self.samples;
+        let slope = self.options.capacity_ah.map(|ah| plausible::check_slope(times, currents, voltages, ah));
+        let grid = grid_unit(times)
+            .filter(|unit| self.is_possible_time_unit(times, Unit::find(unit).unwrap_or(layout.time.unit)));
+        let (what, unit) = match (slope, grid) {
+            (Some(Err(of)), grid) => (of.what, grid.or(of.probable).unwrap_or("min")),
+            (_, Some(unit)) => (format!("advances like {unit}"), unit),
+            _ => return,
+        };
+        self.notes.push(format!(
+            "column {name} {what}, but is read in s; if it is in {unit}, use --column time='{name}[{unit}]'"
+        ));
     }
 
     /// Compares the current with the table's own count of charge.
@@ -406,19 +389,36 @@ impl Judge<'_> {
         }
     }
 
+    /// The directions of states that are numbers, if the voltage shows a charge and a discharge with them.
+    fn codes(&self, layout: &Layout, times: &[f64]) -> Vec<(Vec<u8>, Direction)> {
+        let Samples { states, currents, voltages, .. } = &self.samples;
+        let mut codes: Vec<Vec<u8>> = states.iter().filter(|state| is_code(state)).cloned().collect();
+        codes.sort();
+        codes.dedup();
+        if layout.state.is_none() || codes.len() > MAX_CODES {
+            return Vec::new();
+        }
+        let shown = codes.into_iter().filter_map(|code| {
+            let of_code = |(&i, state): (&f64, &Vec<u8>)| if *state == code || i == 0.0 { i } else { f64::NAN };
+            let currents: Vec<f64> = currents.iter().zip(states).map(of_code).collect();
+            match plausible::shown_sign(times, &currents, voltages) {
+                ShownSign::Charge => Some((code, Direction::Charge)),
+                ShownSign::Discharge => Some((code, Direction::Discharge)),
+                ShownSign::Magnitude | ShownSign::Unclear => None,
+            }
+        });
+        let shown: Vec<_> = shown.collect();
+        let has = |direction| shown.iter().any(|of| of.1 == direction);
+        if has(Direction::Charge) && has(Direction::Discharge) { shown } else { Vec::new() }
+    }
+
     fn sign(&mut self, layout: &Layout, times: &[f64]) -> Result<CurrentSign, TableError> {
-        let sign = |is_charge_positive: bool, source: SignSource| CurrentSign {
-            is_charge_positive,
-            is_by_state: false,
-            is_magnitude_shown: false,
-            source,
-        };
         if let Some(is_charge_positive) = self.options.charge_positive {
-            return Ok(sign(is_charge_positive, SignSource::User));
+            return Ok(CurrentSign::new(is_charge_positive, SignSource::User));
         }
         let samples = &self.samples;
         let largest = samples.currents.iter().filter(|i| i.is_finite()).fold(0.0_f64, |max, i| max.max(i.abs()));
-        let is_never_negative = samples.currents.iter().all(|&i| i.is_nan() || i >= -0.001 * largest);
+        let negative = samples.currents.iter().filter(|&&i| i < -0.001 * largest).count();
         let count = |wanted: Direction, is_positive: bool| {
             let rows = samples.directions.iter().zip(&samples.currents);
             rows.filter(|&(direction, &i)| {
@@ -427,11 +427,20 @@ impl Judge<'_> {
             .count()
         };
         let [discharges, charges] = [Direction::Discharge, Direction::Charge].map(|direction| count(direction, true));
-        if is_never_negative && discharges + charges > 0 {
-            let by_state =
-                CurrentSign { is_by_state: true, is_magnitude_shown: discharges > 0, ..sign(true, SignSource::State) };
-            return Ok(by_state);
+        // With charges and discharges of a positive current, single negative currents are faults of a magnitude.
+        let is_magnitude = charges > 0 && discharges > 0 && 100 * negative <= samples.currents.len();
+        let is_never_negative = negative == 0 || is_magnitude;
+        let codes = if is_never_negative { self.codes(layout, times) } else { Vec::new() };
+        if is_never_negative && discharges + charges + codes.len() > 0 {
+            let noise_a = 0.01 * largest;
+            self.notes.extend(codes.iter().map(|(code, direction)| {
+                format!("state {} is a {direction:?} by the voltage", String::from_utf8_lossy(code)).to_lowercase()
+            }));
+            let has_positive = [charges > 0 || !codes.is_empty(), discharges > 0 || !codes.is_empty()];
+            let by_state = CurrentSign::new(true, SignSource::State);
+            return Ok(CurrentSign { is_by_state: true, has_positive, noise_a, codes, ..by_state });
         }
+        let samples = &self.samples;
         let shown = plausible::shown_sign(times, &samples.currents, &samples.voltages);
         if shown == ShownSign::Magnitude {
             let name = layout.current().map_or("", |column| self.header.names()[column.index].as_str());
@@ -440,6 +449,9 @@ impl Judge<'_> {
                  another: a magnitude without a sign; name the column that says charge or discharge with --column \
                  state=NAME, or give --csv-sign"
             )));
+        }
+        if is_never_negative && largest > 0.0 && layout.format.charge_positive().is_none() {
+            self.notes.push("the current is never negative in the first rows".to_owned());
         }
         let by_state = (charges + count(Direction::Discharge, false), discharges + count(Direction::Charge, false));
         let from_state = (by_state.0 + by_state.1 >= 5 && by_state.0.min(by_state.1) * 4 <= by_state.0.max(by_state.1))
@@ -453,89 +465,52 @@ impl Judge<'_> {
                      reverses it"
                 ));
             }
-            return Ok(sign(is_charge_positive, SignSource::Format));
+            return Ok(CurrentSign::new(is_charge_positive, SignSource::Format));
         }
         if let Some(is_charge_positive) = from_state {
-            return Ok(sign(is_charge_positive, SignSource::State));
+            return Ok(CurrentSign::new(is_charge_positive, SignSource::State));
         }
         match shown {
-            ShownSign::Charge => return Ok(sign(true, SignSource::Voltage)),
-            ShownSign::Discharge => return Ok(sign(false, SignSource::Voltage)),
+            ShownSign::Charge => return Ok(CurrentSign::new(true, SignSource::Voltage)),
+            ShownSign::Discharge => return Ok(CurrentSign::new(false, SignSource::Voltage)),
             ShownSign::Magnitude | ShownSign::Unclear => {}
         }
-        if is_never_negative && largest > 0.0 {
-            self.notes.push("the current is never negative".to_owned());
-        }
         self.notes.push("nothing shows the sign of the current; --csv-sign charge reverses it".to_owned());
-        Ok(sign(false, SignSource::Nothing))
+        Ok(CurrentSign::new(false, SignSource::Nothing))
     }
 }
 
-impl CurrentSign {
-    /// The current with positive = discharge. `None` if a magnitude is negative.
-    pub(super) fn discharge(&mut self, value: f64, direction: Option<Direction>) -> Option<f64> {
-        if self.is_by_state && direction == Some(Direction::Discharge) {
-            if value >= 0.0 {
-                self.is_magnitude_shown = true;
-                return Some(value);
-            }
-            if self.is_magnitude_shown {
-                return None;
-            }
-            // The first discharge is negative: the current has a sign, which the charges before it could not show.
-            self.is_by_state = false;
-        }
-        Some(if self.is_charge_positive { -value } else { value })
-    }
+/// Whether a state is a number, whose meaning only the voltage can show.
+fn is_code(state: &[u8]) -> bool {
+    !state.is_empty() && state.iter().all(u8::is_ascii_digit)
 }
 
 fn is_voltage(channel: Channel) -> bool {
     matches!(channel, Channel::PackVoltage | Channel::CellVoltage(_))
 }
 
-/// The unit in which times advance by whole seconds, if they do not do so in seconds: rows every 1/60 are minutes.
+/// The unit in which times advance by whole seconds, if they are no decimal numbers of seconds: rows every 1/60 are
+/// minutes. Times with more than three decimals or uneven steps are not decimal.
 fn grid_unit(times: &[f64]) -> Option<&'static str> {
-    let steps: Vec<f64> = times.windows(2).map(|pair| pair[1] - pair[0]).filter(|step| *step > 0.0).collect();
-    let middle = median(&steps)?;
-    // Rounded times have steps of two lengths. Gaps and other sampling rates do not count, and must be rare.
-    let usual: Vec<f64> = steps.iter().copied().filter(|step| *step < 3.0 * middle).collect();
-    let step = usual.iter().sum::<f64>() / usual.len() as f64;
-    let even = usual.iter().filter(|of| (0.5 * step..1.5 * step).contains(*of)).count();
-    if even * 10 < steps.len() * 9 {
+    let step = plausible::median_step(times).filter(|step| (0.0..0.9).contains(step) && *step > 0.0)?;
+    let known: Vec<f64> = times.iter().copied().filter(|time| time.is_finite()).collect();
+    let is_most = |is: &dyn Fn(f64) -> bool| known.iter().filter(|time| is(**time)).count() * 10 >= known.len() * 9;
+    let is_whole = |value: f64, tolerance: f64| (value - value.round()).abs() <= tolerance;
+    let digits = (1..9).find(|&digits| is_most(&|time| is_whole(time * 10_f64.powi(digits), 1e-6))).unwrap_or(9);
+    let has_decimal_step = is_whole(step * 1e4, 1e-6) && is_most(&|time| is_whole((time - known[0]) / step, 1e-6));
+    if has_decimal_step || known.len() < 20 {
         return None;
     }
-    let is_whole = |value: f64, tolerance: f64| value >= 0.9 && (value - value.round()).abs() < tolerance * value;
-    let is_decimal = is_whole(step * 1000.0, 0.0005);
-    if step >= 0.9 || is_decimal || usual.len() < 10 {
-        return None;
-    }
-    [("min", 60.0), ("h", 3600.0)].into_iter().find(|(_, factor)| is_whole(step * factor, 0.004)).map(|of| of.0)
+    let unit = [("min", 60.0), ("h", 3600.0)].into_iter().find(|(_, factor)| {
+        let rounding = factor * (0.5 * 10_f64.powi(-digits)) + 1e-6;
+        rounding < 0.35 && is_most(&|time| is_whole(time * factor, rounding))
+    });
+    unit.map(|of| of.0)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn states_of_cyclers_give_direction() {
-        for (state, expected) in [
-            ("D", Some(Direction::Discharge)),
-            ("C", Some(Direction::Charge)),
-            ("CC DChg", Some(Direction::Discharge)),
-            ("CC_Chg", Some(Direction::Charge)),
-            ("CCCV Chg", Some(Direction::Charge)),
-            ("DCH", Some(Direction::Discharge)),
-            ("CHA", Some(Direction::Charge)),
-            ("Discharging", Some(Direction::Discharge)),
-            ("charging", Some(Direction::Charge)),
-            ("Rest", None),
-            ("PAU", None),
-            ("R", None),
-            ("0", None),
-        ] {
-            assert_eq!(direction(state.as_bytes()), expected, "{state}");
-        }
-    }
 
     #[test]
     fn steps_of_a_sixtieth_are_minutes() {

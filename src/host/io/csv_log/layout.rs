@@ -1,13 +1,17 @@
 //! Chooses the columns of a table of samples.
 //!
 //! In: the header and the options. Out: a [`Layout`]: for each role the column and its unit. A column has the name that
-//! the user gives, else a name of the [dictionary](super::dictionary). A unit that does not fit the role is an error.
+//! the user gives, else a name of the [dictionary](super::dictionary). Of several columns, the first whose values in the
+//! first rows can be read is chosen. A unit that does not fit the role is an error.
 
 use super::CsvOptions;
 use super::column_name::ColumnName;
-use super::dictionary::{Format, Known, Role, known};
+use super::dictionary::{Format, Known, Role, known, unknown_unit};
+use super::state::direction;
+use super::time_text::TimeText;
 use crate::can::decode::{Channel, SensorIndex};
-use crate::io::table::{Header, PART_COLUMNS, TableError};
+use crate::io::plausible;
+use crate::io::table::{FirstRows, Header, PART_COLUMNS, TableError, parse_field};
 use crate::io::units::{Quantity, Unit};
 use crate::quantity::CellIndex;
 
@@ -35,11 +39,15 @@ pub(super) struct Layout {
     pub(super) section: Option<usize>,
     /// Whether the user names the section column.
     pub(super) is_section_named: bool,
+    /// Remarks for the user.
+    pub(super) notes: Vec<String>,
 }
 
 impl Layout {
-    pub(super) fn find(header: &Header, options: &CsvOptions) -> Result<Self, TableError> {
-        Columns::new(header, options).layout()
+    pub(super) fn find(first: &FirstRows, options: &CsvOptions) -> Result<Self, TableError> {
+        let mut columns = Columns::new(&first.header, options);
+        columns.keep_readable(first);
+        columns.layout()
     }
 
     pub(super) fn current(&self) -> Option<Column> {
@@ -60,8 +68,24 @@ impl<'a> Columns<'a> {
         let roles = |(index, name): (usize, &String)| {
             known(name, header.unit_text(index)).into_iter().map(move |known| (index, known)).collect::<Vec<_>>()
         };
-        let known = header.names().iter().enumerate().flat_map(roles).collect();
+        let mut known: Vec<(usize, Known)> = header.names().iter().enumerate().flat_map(roles).collect();
+        let name = |index: usize| header.names()[index].trim();
+        let is_bare_t = |index: usize, of: &Known| of.unit.is_none() && name(index).eq_ignore_ascii_case("t");
+        let has_time = known.iter().any(|(index, of)| group(of.role) == Role::Date && !is_bare_t(*index, of));
+        // `T` next to a time is a temperature, `t` is nothing; without another time, both are the time.
+        let is_meant = |index: usize, of: &Known| match of.role {
+            Role::Temperature => has_time && name(index) == "T",
+            _ => !has_time,
+        };
+        known.retain(|(index, of)| !is_bare_t(*index, of) || is_meant(*index, of));
         Self { header, options, format: Format::of(header.names()), known }
+    }
+
+    /// Drops the columns whose first values cannot be read, if those of another column can be.
+    fn keep_readable(&mut self, first: &FirstRows) {
+        let readable: Vec<Role> =
+            self.known.iter().filter(|(index, of)| is_readable(first, *index, of)).map(|of| group(of.1.role)).collect();
+        self.known.retain(|(index, of)| !readable.contains(&group(of.role)) || is_readable(first, *index, of));
     }
 
     fn layout(&self) -> Result<Layout, TableError> {
@@ -85,7 +109,22 @@ impl<'a> Columns<'a> {
             discharged: discharged.or_else(net).filter(|(column, _)| column.is_stated),
             section,
             is_section_named,
+            notes: self.left_out(),
         })
+    }
+
+    /// Remarks on temperatures in an unknown unit.
+    fn left_out(&self) -> Vec<String> {
+        let unknown = self.unknown_units().filter(|(_, role, _)| *role == Role::Temperature);
+        unknown
+            .map(|(name, _, unit)| format!("column {name} is left out, because its unit {unit:?} is unknown"))
+            .collect()
+    }
+
+    fn unknown_units(&self) -> impl Iterator<Item = (&'a String, Role, String)> {
+        let unit = |index: usize| self.header.unit_text(index);
+        let names = self.header.names().iter().enumerate();
+        names.filter_map(move |(index, name)| unknown_unit(name, unit(index)).map(|(role, unit)| (name, role, unit)))
     }
 
     fn mapped(&self, role: &str) -> Option<&'a str> {
@@ -127,6 +166,13 @@ impl<'a> Columns<'a> {
     }
 
     fn missing(&self, role: &str, name: &str) -> TableError {
+        let is_wanted = |of: Role| of.quantity().is_some_and(|quantity| role.starts_with(quantity.name()));
+        if let Some((name, _, unit)) = self.unknown_units().find(|(_, of, _)| is_wanted(*of)) {
+            return self.header.fault(format_args!(
+                "column {name}: unknown unit {unit:?}; write a known unit into the header, or use --column \
+                 {role}='{name}[UNIT]'"
+            ));
+        }
         let what = if name.is_empty() { String::new() } else { format!(" {name}") };
         self.header.fault(format_args!(
             "no column{what} for {role}, found {}; name it with --column {role}=NAME, or {role}='NAME[UNIT]'",
@@ -252,7 +298,14 @@ impl<'a> Columns<'a> {
             return Ok(());
         }
         if self.options.pack_total {
-            channels.push((Channel::PackVoltage, self.required("voltage", Role::Voltage, Quantity::Voltage)?));
+            // A name that says that it is of the pack comes later in the dictionary.
+            let best = self.known.iter().filter(|of| of.1.role == Role::Voltage).map(|of| of.1.rank).max();
+            let named = self.known.iter().find(|of| of.1.role == Role::Voltage && Some(of.1.rank) == best);
+            let column = match (self.mapped("voltage"), named) {
+                (None, Some(&named)) => self.column(named),
+                _ => self.required("voltage", Role::Voltage, Quantity::Voltage)?,
+            };
+            channels.push((Channel::PackVoltage, column));
             return Ok(());
         }
         let single = if self.mapped("voltage").is_some() { None } else { self.best(Role::Voltage) };
@@ -295,5 +348,37 @@ impl<'a> Columns<'a> {
                 }
             })
             .collect())
+    }
+}
+
+/// Roles among which the readable columns are preferred: a time and a date replace each other.
+fn group(role: Role) -> Role {
+    if role == Role::Time { Role::Date } else { role }
+}
+
+/// Whether the first values of a column can be what its role says.
+fn is_readable(first: &FirstRows, index: usize, known: &Known) -> bool {
+    const JUDGED_ROWS: usize = 200;
+    let rows = || first.rows().take(JUDGED_ROWS);
+    let is_half = |read: usize, of: usize| read > 0 && 2 * read >= of;
+    match known.role {
+        Role::Time | Role::Date => {
+            let mut reader = TimeText::new(known.unit.unwrap_or(Unit::base(Quantity::Time)));
+            let texts: Vec<_> = rows().map(|row| row.text(index)).collect();
+            reader.is_day_first = TimeText::is_day_first(&texts).0;
+            // Numbers may be in any unit, so their size does not matter.
+            let number = |text: &str| {
+                parse_field(text.as_bytes()).flatten().or_else(|| Some(reader.parse(text.as_bytes())?.secs()))
+            };
+            let times: Vec<f64> = texts.iter().map(|text| text.trim()).filter_map(number).collect();
+            is_half(times.len(), texts.len()) && plausible::check_order(&times).is_ok()
+        }
+        Role::State => rows().any(|row| row.bytes(index).and_then(direction).is_some()),
+        Role::Step | Role::StepTime | Role::CellVoltage => true,
+        Role::Temperature if known.number.is_some() => true,
+        _ => {
+            let texts: Vec<_> = rows().map(|row| row.parsed(index)).filter(|of| *of != Some(None)).collect();
+            is_half(texts.iter().flatten().count(), texts.len())
+        }
     }
 }

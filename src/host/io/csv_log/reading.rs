@@ -2,8 +2,9 @@
 
 use serde::Serialize;
 
-use super::judge::{Judgement, SignSource};
+use super::judge::Judgement;
 use super::layout::{Column, Layout};
+use super::state::SignSource;
 use super::time_text::TimeForm;
 use super::{Channel, CsvOptions};
 use crate::io::table::Header;
@@ -21,6 +22,9 @@ pub struct TableReading {
     pub read: u64,
     /// Currents that were refused because they are impossible.
     pub refused_currents: u64,
+    /// Whether a column of temperatures is read.
+    #[serde(skip)]
+    pub has_temperature: bool,
     /// The largest possible current (A), for the message.
     #[serde(skip)]
     largest_current: String,
@@ -50,6 +54,7 @@ impl TableReading {
             rows: 0,
             read: 0,
             refused_currents: 0,
+            has_temperature: layout.channels.iter().any(|(channel, _)| matches!(channel, Channel::Temperature(_))),
             largest_current: super::PackSize { capacity_ah: options.capacity_ah }.max_current_a().to_string(),
         }
     }
@@ -103,9 +108,14 @@ fn time(header: &Header, layout: &Layout, judgement: &Judgement) -> String {
         TimeForm::Clock => "h:m:s",
         TimeForm::Date => "dates",
     };
-    let assumed = if judgement.is_time_assumed { " (assumed)" } else { "" };
     let step = if layout.is_step_time { " of the step" } else { "" };
     let (number, name) = (layout.time.index + 1, quoted(header, layout.time.index));
+    let assumed = match judgement.is_time_assumed {
+        true => {
+            format!(" (assumed; if it is another, use --column time='{}[UNIT]')", header.names()[layout.time.index])
+        }
+        false => String::new(),
+    };
     format!("time{step}: column {number} {name} in {form}{assumed}")
 }
 
@@ -124,7 +134,7 @@ fn group(name: &str, header: &Header, columns: &[Column]) -> Option<String> {
 }
 
 fn sign(judgement: &Judgement) -> String {
-    let sign = judgement.sign;
+    let sign = &judgement.sign;
     if sign.is_by_state {
         return "a magnitude with its sign from".to_owned();
     }

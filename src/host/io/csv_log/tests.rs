@@ -56,6 +56,57 @@ fn signed_current_after_long_charge_keeps_sign() {
 }
 
 #[test]
+fn one_sided_beginning_does_not_decide_magnitude() {
+    // A discharge of a megabyte, then a charge: signed with either sign, or a magnitude.
+    let rows = |sign: f64, word: &str, count: usize| -> String {
+        (0..count).map(|_| format!("{},3.7,{word}\n", sign * 2.0)).collect()
+    };
+    for (discharge, charge) in [(1.0, -1.0), (-1.0, 1.0), (1.0, 1.0)] {
+        let all = rows(discharge, "DSG", 80_000) + &rows(charge, "CHG", 10);
+        let numbered: String = all.lines().enumerate().map(|(n, row)| format!("{n},{row}\n")).collect();
+        let mut log = open(&format!("Time (s),Current (A),Voltage (V),State\n{numbered}")).expect("opens");
+        let mut currents = Vec::new();
+        while let Some(row) = log.next_row().expect("reads") {
+            assert!(row.is_ok());
+            currents.push(log.values[0].1);
+        }
+        assert_eq!((currents[79_999], currents[80_009]), (Some(2.0), Some(-2.0)), "{discharge} {charge}");
+    }
+}
+
+#[test]
+fn magnitude_in_unknown_state_is_refused_by_name() {
+    let mut log = open("Time (s),Current (A),Voltage (V),State\n0,1,3.9,C\n1,2,3.7,D\n2,2,3.7,Boost\n3,0,3.7,Boost\n")
+        .expect("opens");
+    let mut faults = Vec::new();
+    while let Some(row) = log.next_row().expect("reads") {
+        faults.extend(row.err().map(|fault| fault.to_string()));
+    }
+    let expected =
+        "cell.csv:4: column State: found \"Boost\", must be charge, discharge or rest, because the current has no sign";
+    assert_eq!(faults, [expected]);
+}
+
+#[test]
+fn voltage_of_pack_is_preferred_for_pack() {
+    let options = CsvOptions { cells: 4, series: 4, pack_total: true, ..CsvOptions::default() };
+    let text = "Time (s),Current (A),Voltage (V),Pack Voltage (V)\n0,1,12.4,15\n";
+    let log = CsvLog::open(Box::new(std::io::Cursor::new(text)), Path::new("x.csv"), &options).expect("opens");
+    assert!(log.reading().to_string().contains("\"Pack Voltage (V)\""), "{}", log.reading());
+}
+
+#[test]
+fn dates_without_a_clear_order_say_it() {
+    for (days, expected) in
+        [(["03-04", "03-04"], "read as month/day"), (["03-04", "04-04"], "read as day/month"), (["13-04", "14-04"], "")]
+    {
+        let rows: String = days.iter().map(|day| format!("{day}-2023 10:00:00,1,3.7\n")).collect();
+        let said = open(&format!("Date,Current (A),Voltage (V)\n{rows}")).expect("opens").reading().to_string();
+        assert!(said.contains(expected) && said.contains("dates are read") != expected.is_empty(), "{said}");
+    }
+}
+
+#[test]
 fn truncated_text_never_panics() {
     let whole = "EC-Lab ASCII FILE\r\nNb header lines : 3\r\ntime/s\tEcell/V\tI/mA\r\n0,0\t3,7\t10\r\n1,0\t3,7\t20\r\n";
     for length in 0..whole.len() {

@@ -43,6 +43,29 @@ impl TimeText {
         if is_date { TimeForm::Date } else { TimeForm::Clock }
     }
 
+    /// Whether dates begin with the day, and whether this is a guess: the order that makes the record shorter, or the
+    /// month.
+    pub(super) fn is_day_first(texts: &[impl AsRef<str>]) -> (bool, bool) {
+        let texts = || texts.iter().map(|text| text.as_ref().trim().trim_matches('"'));
+        let numbers = |text: &str| {
+            let mut numbers = text.split(['/', '-', ' ']).map(|part| part.parse::<u32>().unwrap_or(0));
+            (numbers.next().unwrap_or(0), numbers.next().unwrap_or(0))
+        };
+        if texts().any(|text| (13..=31).contains(&numbers(text).0)) {
+            return (true, false);
+        }
+        let is_open = |(first, second): (u32, u32)| (1..13).contains(&first) && (1..13).contains(&second);
+        if !texts().all(|text| is_open(numbers(text))) {
+            return (false, false);
+        }
+        let span = |is_day_first: bool| {
+            let times: Vec<i64> =
+                texts().filter_map(|text| stamp::parse_date(text, is_day_first)).map(Timestamp::nanos).collect();
+            times.iter().max().zip(times.iter().min()).map(|(last, first)| last - first)
+        };
+        (span(true) < span(false), true)
+    }
+
     /// Reads a time. Returns `None` if the text is none.
     pub(super) fn parse(&mut self, field: &[u8]) -> Option<Timestamp> {
         let field = field.strip_prefix(b"\"").and_then(|field| field.strip_suffix(b"\"")).unwrap_or(field);
@@ -59,13 +82,12 @@ impl TimeText {
     }
 
     fn number(&self, text: &str) -> Option<Timestamp> {
-        let nanos = self.unit.nanos()?;
-        if let Ok(count) = text.parse::<i64>() {
+        if let (Ok(count), Some(nanos)) = (text.parse::<i64>(), self.unit.nanos()) {
             return count.checked_mul(nanos).map(Timestamp::from_nanos).filter(|time| is_representable(*time));
         }
         let seconds = self.unit.convert(text.parse().ok()?);
         // Programs round minutes, hours and days to some digits, so the first sample after a minute is not at 60 s.
-        let seconds = if nanos > 1_000_000_000 { (seconds * 1e4).round() / 1e4 } else { seconds };
+        let seconds = if self.unit.per_base() < 1.0 { (seconds * 1e4).round() / 1e4 } else { seconds };
         let time = seconds.is_finite().then(|| Timestamp::from_secs(seconds));
         time.filter(|time| is_representable(*time))
     }
@@ -77,7 +99,8 @@ impl TimeText {
             self.days += 1;
         }
         self.last_clock = Some(nanos);
-        Some(Timestamp::from_nanos(nanos + self.days * DAY_NS))
+        let time = Timestamp::from_nanos(nanos).plus_nanos(self.days.saturating_mul(DAY_NS));
+        is_representable(time).then_some(time)
     }
 }
 
@@ -101,7 +124,17 @@ mod tests {
         assert_eq!(times("min", &["0.5", "1"]), [Some(30_000), Some(60_000)]);
         assert_eq!(times("ms", &["1700000000123"]), [Some(1_700_000_000_123)]);
         assert_eq!(times("s", &["1700000000123000"]), [None]);
+        assert_eq!(times("Excel days", &["45244", "45244.5"]), [Some(1_699_920_000_000), Some(1_699_963_200_000)]);
         assert_eq!(times("s", &["\"0,5\"", "x", ""]), [Some(500), None, None]);
+    }
+
+    #[test]
+    fn any_text_of_a_time_is_read_or_refused() {
+        proptest::proptest!(|(text in proptest::collection::vec("[0-9:dT .,+/-]{0,24}|.{0,9}|23:59:59|0:0:0|2562047:47:16", 1..9))| {
+            times("s", &text.iter().map(String::as_str).collect::<Vec<_>>());
+            times("h", &text.iter().map(String::as_str).collect::<Vec<_>>());
+        });
+        assert_eq!(times("s", &["23:59:59", "2562047:47:16", "23:59:59", "0:00:00"])[3], Some(86_400_000));
     }
 
     #[test]

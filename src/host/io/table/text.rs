@@ -167,6 +167,30 @@ fn most_frequent(line: &[u8]) -> u8 {
 
 /// Splits a line that may be a header. Quotes around a field are removed.
 fn split(line: &[u8], separator: u8) -> Vec<String> {
-    let fields = line.split(|&byte| byte == separator);
-    fields.map(|field| String::from_utf8_lossy(field).trim().trim_matches('"').to_owned()).collect()
+    let parts: Vec<&[u8]> = line.split(|&byte| byte == separator).collect();
+    let text = |field: Vec<u8>| String::from_utf8_lossy(&field).trim().trim_matches('"').to_owned();
+    join_quoted(&parts, separator).into_iter().map(text).collect()
+}
+
+/// Whether a part of a line is the beginning of a quoted field that holds separators.
+pub(super) fn opens_quote(part: &[u8]) -> bool {
+    let part = part.trim_ascii();
+    part.starts_with(b"\"") && (part.len() == 1 || !part.ends_with(b"\""))
+}
+
+/// Joins the parts of quoted fields that hold separators. A quote without an end stays.
+pub(super) fn join_quoted(parts: &[&[u8]], separator: u8) -> Vec<Vec<u8>> {
+    let closes = |part: &[u8]| {
+        let part = part.trim_ascii();
+        part.ends_with(b"\"") && (part.len() == 1 || !part.starts_with(b"\""))
+    };
+    let mut fields = Vec::new();
+    let mut rest = parts;
+    while let [first, after @ ..] = rest {
+        let end = opens_quote(first).then(|| after.iter().position(|part| closes(part))).flatten();
+        let (field, after) = rest.split_at(end.map_or(1, |end| end + 2));
+        fields.push(field.join(&separator));
+        rest = after;
+    }
+    fields
 }

@@ -1,0 +1,160 @@
+//! Reads the direction of the current from a state column, and gives the current its sign.
+//!
+//! In: states such as `D`, `CC_DChg`, `Entladen` or `Not charging`, and currents with or without a sign. Out: the
+//! [`Direction`], and the current with positive = discharge. `None` stands for a state without a direction, and for a
+//! current whose sign is unknown.
+
+/// Direction of the current in a row, according to the state column.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Direction {
+    Charge,
+    Discharge,
+}
+
+/// Parts of words for a discharge, without accents.
+const DISCHARGE: &str = "disch dsch dch dsg dech entlad ontlad utlad urlad aflad descarg scaric rozlad \
+    \u{440}\u{430}\u{437}\u{440}\u{44f}\u{434} \u{653e}\u{7535} \u{653e}\u{96fb}";
+/// Parts of words for a charge.
+const CHARGE: &str = "charg chrg chg regen lade ladu ladd ladn ladi ladow carga caric \
+    \u{437}\u{430}\u{440}\u{44f}\u{434} \u{5145}\u{7535} \u{5145}\u{96fb}";
+/// Words for no current.
+const REST: &str = "r p s o rest resting pau pause pse idle standby ocv ocp wait waiting ruhe relax repos stop stopped open off end ready \
+    full float finished none \u{9759}\u{7f6e} \u{6401}\u{7f6e} \u{4f11}\u{6b62}";
+/// Words that negate the others.
+const NEGATION: &str = "not no non nicht kein keine without";
+
+/// The words of a state in lower case, without accents.
+fn words(state: &[u8]) -> Vec<String> {
+    let text = String::from_utf8_lossy(state).to_lowercase().replace("notch", "not ch").replace("notd", "not d");
+    let plain = text.chars().map(|c| match c {
+        '\u{e8}'..='\u{eb}' => 'e',
+        '\u{e0}'..='\u{e5}' => 'a',
+        '\u{142}' => 'l',
+        c => c,
+    });
+    let plain: String = plain.collect();
+    plain.split(|c: char| !c.is_alphanumeric()).filter(|word| !word.is_empty()).map(str::to_owned).collect()
+}
+
+/// Whether a state says that no current flows.
+pub(super) fn is_rest(state: &[u8]) -> bool {
+    let words = words(state);
+    let is_any = |list: &str| words.iter().any(|word| list.split(' ').any(|of| of == word));
+    is_any(NEGATION) || (is_any(REST) && direction(state).is_none())
+}
+
+/// Reads the direction from a state; `None` for a rest and for an unknown state.
+pub(super) fn direction(state: &[u8]) -> Option<Direction> {
+    let words = words(state);
+    let is = |list: &str| words.iter().any(|word| list.split(' ').any(|of| of == word));
+    let has = |parts: &str| words.iter().any(|word| parts.split(' ').any(|part| word.contains(part)));
+    let is_divided = words.windows(2).any(|pair| ["d", "dis", "de"].contains(&&*pair[0]) && pair[1].starts_with("ch"));
+    match () {
+        () if is(NEGATION) => None,
+        () if is("d dis ent") || is_divided || has(DISCHARGE) => Some(Direction::Discharge),
+        () if is("c ch cha lad") || has(CHARGE) => Some(Direction::Charge),
+        () => None,
+    }
+}
+
+/// What decides the sign of the current.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum SignSource {
+    User,
+    Format,
+    State,
+    Voltage,
+    Nothing,
+}
+
+/// Sign of the current.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct CurrentSign {
+    pub(super) is_charge_positive: bool,
+    /// Whether the current is a magnitude whose sign the state column gives.
+    pub(super) is_by_state: bool,
+    /// Whether charges and discharges with a positive current have occurred. Both together show a magnitude.
+    pub(super) has_positive: [bool; 2],
+    /// Largest current that counts as none (A).
+    pub(super) noise_a: f64,
+    /// Directions of states that are numbers.
+    pub(super) codes: Vec<(Vec<u8>, Direction)>,
+    pub(super) source: SignSource,
+}
+
+impl CurrentSign {
+    pub(super) fn new(is_charge_positive: bool, source: SignSource) -> Self {
+        let has_positive = [false; 2];
+        Self { is_charge_positive, is_by_state: false, has_positive, noise_a: 0.0, codes: Vec::new(), source }
+    }
+
+    /// The direction of a state.
+    pub(super) fn direction(&self, state: &[u8]) -> Option<Direction> {
+        direction(state).or_else(|| self.codes.iter().find(|(code, _)| code == state).map(|of| of.1))
+    }
+
+    /// The current with positive = discharge. `None` if a magnitude is negative or flows without a direction.
+    pub(super) fn discharge(&mut self, value: f64, direction: Option<Direction>) -> Option<f64> {
+        if self.is_by_state {
+            let Some(direction) = direction else { return (value.abs() <= self.noise_a).then_some(value) };
+            let is_discharge = direction == Direction::Discharge;
+            if value >= -self.noise_a {
+                self.has_positive[usize::from(is_discharge)] |= value > self.noise_a;
+                return Some(if is_discharge { value } else { -value });
+            }
+            if self.has_positive == [true; 2] {
+                return None;
+            }
+            // The first negative current shows a sign, which the one-sided rows before it could not show.
+            self.is_by_state = false;
+            self.is_charge_positive = if is_discharge { !self.has_positive[1] } else { self.has_positive[0] };
+        }
+        let discharge_a = if self.is_charge_positive { -value } else { value };
+        // A discharge in the state of a charge contradicts the sign that a single negative current has shown.
+        let is_contradicted = self.noise_a > 0.0 && direction == Some(Direction::Charge) && discharge_a > self.noise_a;
+        (!is_contradicted).then_some(discharge_a)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn states_of_cyclers_give_direction() {
+        for (state, expected) in [
+            ("D", Some(Direction::Discharge)),
+            ("C", Some(Direction::Charge)),
+            ("CC DChg", Some(Direction::Discharge)),
+            ("CC_Chg", Some(Direction::Charge)),
+            ("CCCV Chg", Some(Direction::Charge)),
+            ("DCH", Some(Direction::Discharge)),
+            ("CHA", Some(Direction::Charge)),
+            ("Discharging", Some(Direction::Discharge)),
+            ("charging", Some(Direction::Charge)),
+            ("Rest", None),
+            ("PAU", None),
+            ("R", None),
+            ("0", None),
+        ] {
+            assert_eq!(direction(state.as_bytes()), expected, "{state}");
+        }
+    }
+
+    #[test]
+    fn words_of_languages_give_direction() {
+        let all = |texts: &str, expected| {
+            for text in texts.split(',') {
+                assert_eq!(direction(text.as_bytes()), expected, "{text}");
+            }
+        };
+        all(
+            "DISCH,DSG,Dischrg,D\u{e9}charge,Entladen,DIS-CHG,CCDChg,D_CC,Dis Charge,descarga,dsch",
+            Some(Direction::Discharge),
+        );
+        all("CHG,Chrg,Charge,Laden,C_CC,Mid-charge,2nd charge,Regen,Carga,CC-CV Cha", Some(Direction::Charge));
+        all("Not charging,NotCharging,No discharge,Idle,Unknown,OK,1,change,Channel", None);
+        assert!(["Not charging", "Rest", "PAU", "Idle", "R"].iter().all(|text| is_rest(text.as_bytes())));
+        assert!(["CC", "Driving", "1", ""].iter().all(|text| !is_rest(text.as_bytes())));
+    }
+}
