@@ -201,7 +201,7 @@ const OF_TOTAL: &[Mistake] = &[
     ("3", &[("cells = 96", "cells = 49")], &["49 cells cannot have this pack voltage"]),
     ("4, fewer", &[("cells = 96", "cells = 86")], &["number of cells", "contradicts the reported SOC"]),
     ("4, more", &[("cells = 96", "cells = 108")], &["number of cells", "contradicts the reported SOC"]),
-    ("14", &[("nmc-graphite", "lfp-graphite")], &["100 to 145 cells", "or pack.chemistry is wrong", "nmc-graphite"]),
+    ("14", &[("nmc-graphite", "lfp-graphite")], &["100 to 145 cells", "pack.chemistry is wrong", "nmc-graphite"]),
 ];
 
 /// Tries the mistakes of a pack. Returns those that are not named.

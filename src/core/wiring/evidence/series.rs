@@ -21,6 +21,10 @@ pub struct UnusableCounts {
     pub(crate) not_finite: u64,
 }
 
+/// Shortest missing stretch of a signal (s), and its shortest length in periods of the signal.
+const MISSING_S: f64 = 60.0;
+const MISSING_PERIODS: f64 = 20.0;
+
 /// Statistics of one signal.
 #[derive(Debug, Clone, Default)]
 pub struct Series {
@@ -39,10 +43,14 @@ pub struct Series {
     /// Time between two readings (s).
     pub(crate) gaps: ThinnedSample,
     pub(crate) loss: LossCounter,
+    /// Longest gap that is not a missing stretch (s).
     pub(crate) longest_gap_s: f64,
-    /// Begin of the longest gap.
-    pub(crate) longest_gap_from: Option<Timestamp>,
-    /// Number of gaps that are longer than `max_age_s`: a reading became stale before the next reading.
+    /// Longest missing stretch: begin and length (s).
+    pub(crate) longest_missing: Option<(Timestamp, f64)>,
+    /// Sum of the missing stretches (s).
+    pub(crate) missing_s: f64,
+    /// Number of gaps that are longer than `max_age_s` and not missing stretches: a reading became stale before the next
+    /// reading.
     pub(crate) stale_gaps: u64,
     /// Absolute changes from one value to the next.
     pub(crate) changes: ThinnedSample,
@@ -139,12 +147,19 @@ impl Series {
     fn note_gap(&mut self, time: Timestamp, max_age_s: f64) -> Option<f64> {
         let gap_s = self.last_time.map(|last| time.since(last).max(0.0));
         if let Some(gap_s) = gap_s {
+            // The sender slept, or the signal was left out.
+            let is_missing = gap_s > MISSING_S && gap_s > MISSING_PERIODS * self.period_s().unwrap_or(f64::INFINITY);
             self.gaps.push(gap_s);
             self.loss.push(gap_s);
-            if gap_s > self.longest_gap_s {
-                (self.longest_gap_s, self.longest_gap_from) = (gap_s, self.last_time);
+            if is_missing {
+                self.missing_s += gap_s;
+                let is_longest = self.longest_missing.is_none_or(|(_, longest_s)| gap_s > longest_s);
+                self.longest_missing =
+                    self.last_time.filter(|_| is_longest).map(|from| (from, gap_s)).or(self.longest_missing);
+            } else {
+                self.longest_gap_s = self.longest_gap_s.max(gap_s);
+                self.stale_gaps += u64::from(gap_s > max_age_s);
             }
-            self.stale_gaps += u64::from(gap_s > max_age_s);
         }
         self.last_time = Some(time);
         gap_s

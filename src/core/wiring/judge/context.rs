@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use crate::can::CanId;
 use crate::cell::CellModel;
 use crate::filter::median;
-use crate::quantity::BusIndex;
+use crate::quantity::{BusIndex, Channel};
 use crate::wiring::evidence::Series;
 use crate::wiring::observer::{BusStats, WiringObserver};
 use crate::wiring::plan::{Kind, Plan, SignalPlan};
@@ -40,6 +40,8 @@ pub(super) struct Judge<'d> {
     /// Whether a finding shows that the capacity or the scale of the current is wrong. If so, the resistance, which
     /// scales with the capacity, is not judged.
     pub(super) is_size_explained: bool,
+    /// Whether the reported state of charge confirms the configured capacity.
+    pub(super) is_capacity_confirmed: bool,
     /// Whether a finding shows that the chemistry or the number of cells is wrong. If so, the voltages cannot be
     /// compared with the cell model.
     pub(super) is_model_wrong: bool,
@@ -85,6 +87,7 @@ impl<'d> Judge<'d> {
             is_mixed_up: false,
             is_soc_wrong: false,
             is_size_explained: false,
+            is_capacity_confirmed: false,
             is_model_wrong: false,
             wrong_layouts: Vec::new(),
         }
@@ -111,6 +114,11 @@ impl<'d> Judge<'d> {
 
     pub(super) fn current(&self) -> Option<SignalSeries<'d>> {
         self.signals(Kind::Current).first().copied()
+    }
+
+    /// Whether the current is sent as a magnitude and a direction.
+    pub(super) fn has_direction(&self) -> bool {
+        self.plan.signals.iter().any(|signal| signal.binding.channel == Channel::CurrentDirection)
     }
 
     /// Smallest and largest voltage that the median cell may have (V).
