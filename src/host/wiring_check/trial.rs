@@ -27,7 +27,7 @@ pub fn try_changes(
     let mut left = MAX_TRIALS;
     for finding in report.findings.iter_mut().filter(|finding| finding.severity != Severity::Note) {
         let own = subject(finding);
-        let mut is_solved = !finding.changes.is_empty();
+        let mut is_solved = Some(true).filter(|_| !finding.changes.is_empty());
         for group in std::mem::take(&mut finding.changes).chunk_by(|_, next| !next.is_alternative) {
             let is_exact = left > 0 && group.iter().all(is_exact);
             let outcome = match if is_exact { changed(config, group) } else { None } {
@@ -39,10 +39,14 @@ pub fn try_changes(
                 }
                 _ => Outcome::Untried,
             };
-            is_solved &= matches!(outcome, Outcome::Solved | Outcome::Useless);
+            is_solved = match outcome {
+                Outcome::Untried => None,
+                Outcome::Exchanged(_) => is_solved.and(Some(false)),
+                Outcome::Solved | Outcome::Useless => is_solved,
+            };
             keep(finding, group, outcome);
         }
-        finding.is_solved = Some(is_solved && !finding.changes.is_empty()).filter(|_| left < MAX_TRIALS);
+        finding.is_solved = is_solved.map(|is_solved| is_solved && !finding.changes.is_empty());
     }
 }
 

@@ -86,7 +86,7 @@ fn drifted_against(drift: &Drift) -> String {
     )
 }
 
-fn inverted(judge: &mut Judge<'_>, signal: &SignalPlan, seen: String, why: &str) {
+pub(super) fn inverted(judge: &mut Judge<'_>, signal: &SignalPlan, seen: String, why: &str) {
     let is_csv = judge.plan.is_csv;
     let finding = error(judge, Topic::CurrentSign, "the sign of the current is inverted").seen(seen).why(why);
     if is_csv {

@@ -39,7 +39,8 @@ pub(super) fn check_charge(judge: &mut Judge<'_>) {
         (slope.range >= LEAST_RANGE && slope.distinct >= 5).then_some((signal, slope))
     });
     let pack_ah = judge.pack_ah();
-    let is_explained = |slope: &ChargeSlope| slope.r2 >= EXPLAINED && USUAL.contains(&(slope.capacity_ah / pack_ah));
+    let is_explained =
+        |slope: &ChargeSlope| slope.r2 >= EXPLAINED && USUAL.contains(&(slope.capacity_ah / pack_ah).abs());
     if let Some((signal, slope)) = found.filter(|(_, slope)| series.is_constant() && !is_explained(slope)) {
         return constant(judge, current, signal, slope);
     }
@@ -62,6 +63,11 @@ pub(super) fn check_charge(judge: &mut Judge<'_>) {
     let Some((signal, slope)) = found else { return too_much(judge, current) };
     let ratio = slope.capacity_ah / pack_ah;
     judge.is_capacity_confirmed = is_explained(&slope);
+    if judge.is_capacity_confirmed && ratio < 0.0 && !electrical::is_inverted(judge) {
+        judge.is_mixed_up = true;
+        let seen = format!("{} rises with the configured discharge that {} counts", signal.name, current.name);
+        return electrical::inverted(judge, current, seen, "a discharge lowers the state of charge");
+    }
     let [counted, range] = [slope.charge_range_ah, 100.0 * slope.range].map(number);
     if slope.r2 < 0.3 {
         judge.is_mixed_up = true;
