@@ -289,7 +289,8 @@ fn ocv_v(is_lfp: bool, soc: f64) -> f64 {
     };
     let at = (10.0 * soc).clamp(0.0, 9.999);
     let first = at as usize;
-    curve[first] + (at - first as f64) * (curve[first + 1] - curve[first])
+    // The voltage of a full cell rises steeply.
+    curve[first] + (at - first as f64) * (curve[first + 1] - curve[first]) + 10.0 * (soc - 1.0).max(0.0)
 }
 
 fn right_pack(&(name, is_lfp, start, seconds, current_a, shown): &RightPack) -> Pack {

@@ -91,8 +91,8 @@ impl<'a> Samples<'a> {
             // Taking every n-th payload might drop whole pages.
             payloads.iter().take(MAX_PAYLOADS * pages.len()).collect()
         } else {
-            // The steps from payload to payload show a current.
-            windows(payloads.iter().collect(), MAX_PAYLOADS)
+            // The steps from payload to payload show a current. Over longer times, the charge changes the voltage too.
+            windows(payloads.iter().collect(), MAX_PAYLOADS, 8.0)
         };
         Self { key, bytes, pages, payloads }
     }

@@ -85,6 +85,8 @@ impl Series {
     pub fn of(readings: impl Iterator<Item = (f64, Result<f64, Fault>)>) -> Self {
         // 4096 values suffice for a correlation, and samples of this size fit into memory for thousands of signals.
         const MOST: usize = 4096;
+        // A load changes within some tenths of a second.
+        const FINE_S: f64 = 0.5;
         let mut series = Self::default();
         let mut all = Vec::new();
         for (time_s, value) in readings {
@@ -97,7 +99,7 @@ impl Series {
                 Ok(_) | Err(_) => series.unusable.short += 1,
             }
         }
-        let (times_s, values) = windows(all, MOST).into_iter().unzip();
+        let (times_s, values) = windows(all, MOST, FINE_S).into_iter().unzip();
         (series.times_s, series.values) = (ThinnedSample::of(times_s), ThinnedSample::of(values));
         series
     }
@@ -250,24 +252,21 @@ impl Series {
     }
 }
 
-/// Thins readings. Fast readings are first thinned to a few per second. Then whole windows of time are kept, so that the
-/// steps from reading to reading stay in the sample however long the log is, and all signals keep the same times.
-///
-/// `most`: largest number of readings that are kept.
-pub fn windows<T>(mut readings: Vec<(f64, T)>, most: usize) -> Vec<(f64, T)> {
+/// Thins readings to at most `most`. Fast readings are first thinned to one per `fine_s` (s). Then whole windows of time
+/// are kept, so that the steps from reading to reading stay in the sample however long the log is, and all signals keep
+/// the same times.
+pub fn windows<T>(mut readings: Vec<(f64, T)>, most: usize, fine_s: f64) -> Vec<(f64, T)> {
     // Longer than the period of most signals, and short enough that fast signals keep many windows.
-    const WINDOW_S: f64 = 8.0;
-    // A load changes within some tenths of a second.
-    const FINE_S: f64 = 0.5;
+    let window_s = 16.0 * fine_s;
     let span_s = readings.first().zip(readings.last()).map_or(0.0, |((first_s, _), (last_s, _))| last_s - first_s);
     let period_s = span_s / readings.len().max(1) as f64;
-    let finest = if period_s > 0.0 { (FINE_S / period_s) as usize } else { 1 };
+    let finest = if period_s > 0.0 { (fine_s / period_s) as usize } else { 1 };
     let stride = readings.len().div_ceil(most).min(finest).max(1);
     readings = readings.into_iter().step_by(stride).collect();
     let mut mask = 0_u64;
     while readings.len() > most && mask < u64::MAX >> 1 {
         mask = mask << 1 | 1;
-        readings.retain(|(time_s, _)| (time_s / WINDOW_S) as u64 & mask == 0);
+        readings.retain(|(time_s, _)| (time_s / window_s) as u64 & mask == 0);
     }
     let stride = readings.len().div_ceil(most).max(1);
     readings.into_iter().step_by(stride).collect()

@@ -98,11 +98,13 @@ pub(super) fn check_stopped(judge: &mut Judge<'_>) {
 }
 
 /// How voltages or the reported state of charge (at `place`) show that a current flows, if they do. A resting voltage
-/// relaxes in one direction, and a controller corrects its state of charge by less than its largest error.
+/// relaxes in one direction, and a controller corrects its state of charge by a jump, or by less than its largest error.
 fn movement(run: &[Moment], place: Option<usize>, least_v: f64) -> Option<String> {
     let steps = |sign: f64| run.windows(2).filter(|p| sign * (p[1].voltage_v - p[0].voltage_v) > least_v).count();
-    let (low, high) = ends(place.into_iter().flat_map(|at| run.iter().map(move |moment| moment.reported[at])));
-    if high - low > HIDDEN_SOC {
+    let socs: Vec<f64> = place.map_or_else(Vec::new, |at| run.iter().map(|moment| moment.reported[at]).collect());
+    let (low, high) = ends(socs.iter().copied());
+    let largest = socs.windows(2).map(|pair| (pair[1] - pair[0]).abs()).fold(0.0, f64::max);
+    if high - low > HIDDEN_SOC && largest < 0.5 * (high - low) {
         return Some(format!("the reported SOC moves between {} and {} %", percent(low), percent(high)));
     }
     // One wrong reading makes a step in each direction.
