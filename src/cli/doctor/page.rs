@@ -163,15 +163,8 @@ mod tests {
     use crate::wiring::Topic;
 
     fn change(proposed: &str) -> Change {
-        let place = Some("pack.toml:7".to_owned());
-        Change {
-            table: "pack".to_owned(),
-            key: "cells".to_owned(),
-            proposed: proposed.to_owned(),
-            place,
-            now: None,
-            is_alternative: false,
-        }
+        let (table, key) = ("pack".to_owned(), "cells".to_owned());
+        Change { table, key, proposed: proposed.to_owned(), place: Some("pack.toml:7".to_owned()), ..Change::default() }
     }
 
     #[test]

@@ -102,9 +102,8 @@ pub struct WiringObserver {
     groups: ParameterGroups,
     group_senders: GroupSenders,
     /// Latest direction of a current that is sent as a magnitude, with its time: 1 = discharge, -1 = charge, `None` =
-    /// unknown. `None` until there is a reading.
+    /// unknown. `None` if no direction is configured.
     direction: Option<(Timestamp, Option<f64>)>,
-    has_direction: bool,
     guards: Guards,
     pub(crate) protected: BTreeMap<(BusIndex, CanId), ProtectionStats>,
     /// Voltage responses over short and long blocks.
@@ -160,8 +159,7 @@ impl WiringObserver {
         Self {
             groups: ParameterGroups::new(plan.signals.iter().map(|signal| &signal.binding)),
             group_senders: GroupSenders::default(),
-            direction: None,
-            has_direction: plan.signals.iter().any(|signal| signal.binding.channel == Channel::CurrentDirection),
+            direction: plan.has_direction().then(|| (Timestamp::default(), None)),
             listener: Listener::new(&answers),
             by_question,
             buses: plan.interfaces.iter().map(bus).collect(),
@@ -260,17 +258,7 @@ impl WiringObserver {
     /// Reads signals of a frame's payload or of an answer's data.
     fn read_signals(&mut self, time: Timestamp, wanted: &[(SignalList, usize)], data: &[u8]) {
         let Self {
-            plan,
-            series,
-            more_cells,
-            unconfigured,
-            responses,
-            other_currents,
-            usage,
-            witnesses,
-            direction,
-            has_direction,
-            ..
+            plan, series, more_cells, unconfigured, responses, other_currents, usage, witnesses, direction, ..
         } = self;
         let cells = f64::from(plan.pack.cells.max(1));
         for &(list, index) in wanted {
@@ -282,17 +270,12 @@ impl WiringObserver {
             let SignalPlan { binding, answer, .. } = &signals[index];
             let data = data.get(answer.map_or(0, |answer| answer.first_byte)..).unwrap_or_default();
             let is_configured = list == SignalList::Configured;
-            let is_magnitude = *has_direction && is_configured && binding.channel == Channel::Current;
-            let signed = match *direction {
-                _ if !is_magnitude => None,
+            let signed = match direction.filter(|_| is_configured && binding.channel == Channel::Current) {
+                None => None,
                 Some((since, Some(sign))) if time.since(since) <= plan.max_age_s(Channel::Current) => {
                     Some(Binding { scale: sign * binding.scale, offset: sign * binding.offset, ..binding.clone() })
                 }
-                // A magnitude without its direction is not a current.
-                _ => {
-                    series[index].frames += 1;
-                    continue;
-                }
+                Some(_) => continue,
             };
             let binding = signed.as_ref().unwrap_or(binding);
             let max_age_s = if is_configured { plan.max_age_s(binding.channel) } else { f64::INFINITY };

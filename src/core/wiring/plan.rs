@@ -256,6 +256,11 @@ impl Plan {
         if is_configured { &self.signals[index] } else { &self.unconfigured[index] }
     }
 
+    /// Whether the current is sent as a magnitude and a direction.
+    pub(super) fn has_direction(&self) -> bool {
+        self.signals.iter().any(|signal| signal.binding.channel == Channel::CurrentDirection)
+    }
+
     /// Age from which a reading of the channel is stale (s).
     pub(super) fn max_age_s(&self, channel: Channel) -> f64 {
         self.max_ages_s.get(Kind::of(channel) as usize).copied().flatten().unwrap_or(f64::INFINITY)

@@ -68,7 +68,7 @@ pub enum Topic {
 }
 
 /// A line of the configuration to change.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
 pub struct Change {
     /// Name of the table, for example `input.current`.
     pub table: String,
@@ -142,22 +142,15 @@ impl WiringFinding {
 
     pub(super) fn change(&mut self, table: &str, key: &str, proposed: impl Into<String>) -> &mut Self {
         let (table, key) = (table.to_owned(), key.to_owned());
-        self.changes.push(Change {
-            table,
-            key,
-            proposed: proposed.into(),
-            place: None,
-            now: None,
-            is_alternative: false,
-        });
+        self.changes.push(Change { table, key, proposed: proposed.into(), ..Change::default() });
         self
     }
 
     /// Adds a change that replaces the changes before it.
     pub(super) fn alternative(&mut self, table: &str, key: &str, proposed: impl Into<String>) -> &mut Self {
         let is_alternative = !self.changes.is_empty();
-        self.change(table, key, proposed);
-        self.changes.iter_mut().next_back().into_iter().for_each(|change| change.is_alternative = is_alternative);
+        let (table, key) = (table.to_owned(), key.to_owned());
+        self.changes.push(Change { table, key, proposed: proposed.into(), is_alternative, ..Change::default() });
         self
     }
 

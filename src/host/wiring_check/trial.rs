@@ -161,14 +161,28 @@ mod tests {
 
     fn change(now: Option<&str>) -> Change {
         let (table, key) = ("pack".to_owned(), "cells".to_owned());
-        Change {
-            table,
-            key,
-            proposed: "98".to_owned(),
-            place: None,
-            now: now.map(str::to_owned),
-            is_alternative: false,
+        Change { table, key, proposed: "98".to_owned(), now: now.map(str::to_owned), ..Change::default() }
+    }
+
+    fn report(titles: &[(Severity, Topic, &str)]) -> WiringReport {
+        let mut report = WiringReport::default();
+        for (severity, topic, title) in titles {
+            report.add(WiringFinding::new(*severity, *topic, *title));
         }
+        report
+    }
+
+    #[test]
+    fn proposal_is_solved_only_without_other_finding() {
+        let sign = (Severity::Error, Topic::CurrentSign, "5 sigma");
+        let unit = (Severity::Warning, Topic::Unit, "off");
+        let outcome = |after: &[(Severity, Topic, &str)]| {
+            Outcome::of(&counts(&report(&[sign])), &(Topic::CurrentSign, String::new()), &report(after))
+        };
+        assert!(matches!(outcome(&[]), Outcome::Solved));
+        assert!(matches!(outcome(&[(Severity::Note, Topic::Noise, "noisy")]), Outcome::Solved));
+        assert!(matches!(outcome(&[unit]), Outcome::Exchanged(title) if title == "off"));
+        assert!(matches!(outcome(&[(Severity::Warning, Topic::CurrentSign, "4 sigma")]), Outcome::Useless));
     }
 
     #[test]

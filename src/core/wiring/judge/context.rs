@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use crate::can::CanId;
 use crate::cell::CellModel;
 use crate::filter::median;
-use crate::quantity::{BusIndex, Channel};
+use crate::quantity::BusIndex;
 use crate::wiring::evidence::Series;
 use crate::wiring::observer::{BusStats, WiringObserver};
 use crate::wiring::plan::{Kind, Plan, SignalPlan};
@@ -114,11 +114,6 @@ impl<'d> Judge<'d> {
 
     pub(super) fn current(&self) -> Option<SignalSeries<'d>> {
         self.signals(Kind::Current).first().copied()
-    }
-
-    /// Whether the current is sent as a magnitude and a direction.
-    pub(super) fn has_direction(&self) -> bool {
-        self.plan.signals.iter().any(|signal| signal.binding.channel == Channel::CurrentDirection)
     }
 
     /// Smallest and largest voltage that the median cell may have (V).

@@ -117,13 +117,13 @@ fn missing_input<'d>(judge: &Judge<'d>, kind: Kind) -> Option<MissingInput<'d>> 
 
 fn report(judge: &mut Judge<'_>, MissingInput { names, signal, period_s, hole }: MissingInput<'_>) {
     let Some(first) = judge.observed.first else { return };
-    let is_reported = Kind::of(signal.binding.channel) == Kind::Reported;
     // If current and voltages are missing together, the pack sleeps.
     let is_asleep = names.len() > 1 && use_in(judge, &hole).is_none();
-    let (severity, why) = match (is_asleep, is_reported) {
-        (true, _) => (Severity::Note, "the pack's controller slept while other nodes were awake"),
-        (false, true) => (Severity::Note, LEFT_OUT),
-        (false, false) => (Severity::Warning, LEFT_OUT),
+    let is_minor = is_asleep || Kind::of(signal.binding.channel) == Kind::Reported;
+    let severity = if is_minor { Severity::Note } else { Severity::Warning };
+    let why = match is_asleep {
+        true => "the pack's controller slept while other nodes were awake",
+        false => "the sender, a gateway or the logger left it out; estimates do not know this time",
     };
     let (gap, period, names) = (seconds(hole.seconds()), seconds(period_s), names.join(", "));
     let span = span(first, hole.from, hole.seconds());
@@ -131,8 +131,6 @@ fn report(judge: &mut Judge<'_>, MissingInput { names, signal, period_s, hole }:
         .seen(format!("{} arrives every {period}, but not {span}", signal.name))
         .why(why);
 }
-
-const LEFT_OUT: &str = "the sender, a gateway or the logger left it out; estimates do not know this time";
 
 /// Describes a stretch by its times after the first frame.
 pub(super) fn span(first: Timestamp, from: Timestamp, length_s: f64) -> String {

@@ -44,12 +44,15 @@ pub(super) fn check(judge: &mut Judge<'_>) {
 
 fn absence(judge: &Judge<'_>, signal: &SignalPlan, series: &Series) -> Option<Absence> {
     if series.count() == 0 {
+        let is_magnitude = signal.binding.channel == Channel::Current && judge.plan.has_direction();
+        let is_on_bus = judge.bus(signal.binding.bus).is_some_and(|bus| bus.ids.contains_key(&signal.binding.id));
         return Some(match series.unusable {
+            // Without its direction, a magnitude is not read.
+            _ if series.frames == 0 && is_magnitude && is_on_bus => Absence::Direction,
             _ if series.frames == 0 => Absence::Message,
             unusable if unusable.not_available > 0 => Absence::NotAvailable,
             unusable if unusable.not_finite > 0 => Absence::NotFinite,
             unusable if unusable.short > 0 => Absence::Short,
-            _ if signal.binding.channel == Channel::Current && judge.has_direction() => Absence::Direction,
             _ => Absence::Page,
         });
     }

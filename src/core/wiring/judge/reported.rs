@@ -294,7 +294,7 @@ fn outside(judge: &Judge<'_>, points: &[(OcvEstimate, f64)], model: &CellModel, 
     let ocv_v = |soc: f64| model.ocv_v(&model.grid_position(soc.clamp(0.0, 1.0), temperature_c));
     let is_outside = |(estimate, soc): &&(OcvEstimate, f64)| {
         // A dashboard hides a reserve, most of it below 0 %.
-        let reserve = (0.25 * (1.0 - soc) + 0.05).max(HIDDEN_SOC);
+        let reserve = (0.25 * (1.0 - soc)).max(HIDDEN_SOC);
         let may_be_full = soc + reserve >= 1.0 && estimate.current_a <= dead_a;
         let (low_v, high_v) = (ocv_v(soc - HIDDEN_SOC), ocv_v(soc + reserve));
         // While a pack is full, the charger holds the voltage above the curve.
