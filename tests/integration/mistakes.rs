@@ -246,14 +246,14 @@ type RightPack = (&'static str, bool, f64, u32, fn(f64, f64) -> f64, fn(f64, f64
 
 const RIGHT: &[RightPack] = &[
     ("constant current", false, 0.3, 9000, |_, _| -11.0, true_soc),
-    ("constant power", false, 0.2, 7000, |_, v| -230.0 / v, true_soc),
+    ("constant power", false, 0.2, 4500, |_, v| -230.0 / v, true_soc),
     ("taper", false, 0.1, 1800, |_, v| -830.0 / v * (4.4 - v), true_soc),
     ("full", true, 0.9, 4000, |_, v| (-1000.0 * (3.6 - v)).clamp(-30.0, 0.0), true_soc),
     ("dashboard", false, 0.85, 6000, drive_a, |_, soc| 1.25 * (soc - 0.25) / 0.65),
     ("low dashboard", false, 0.45, 3000, drive_a, |_, soc| (soc - 0.25) / 0.65),
     ("recalibration", false, 0.9, 6000, drive_a, |t, soc| if t > 2600.0 { soc - 0.08 } else { soc }),
     ("asleep", false, 0.7, 9000, |t, v| if (2e3..8e3).contains(&t) { f64::NAN } else { drive_a(t, v) }, true_soc),
-    ("storage", true, 0.6, 9000, |t, _| -40.0 * (t / 2000.0).sin() - 10.0, true_soc),
+    ("storage", true, 0.6, 9000, |t, _| 25.0 * (t / 2000.0).sin(), true_soc),
     ("rest", true, 0.75, 3600, |_, _| 0.15, true_soc),
     ("a minute", false, 0.6, 60, drive_a, true_soc),
     ("coarse SOC", false, 0.9, 5000, drive_a, |_, soc| (200.0 * soc + 1.0).floor() / 200.0),

@@ -145,8 +145,6 @@ pub(crate) struct ChargeSlope {
 /// Pairs of charge (Ah) and reported state of charge. Each stretch ends where the controller corrects its value: the
 /// value jumps much further than the charge.
 fn stretches(moments: &[Moment], place: usize) -> Vec<Vec<(f64, f64)>> {
-    /// Smallest jump.
-    const LEAST: f64 = 0.03;
     /// More jumps than this are the steps of a value that is sent rarely.
     const MOST: usize = 3;
     let points = |stretch: &[Moment]| -> Vec<(f64, f64)> {
@@ -161,7 +159,8 @@ fn stretches(moments: &[Moment], place: usize) -> Vec<Vec<(f64, f64)>> {
         let (charge_ah, soc) = (range(|point| point.0), range(|point| point.1));
         let goes_on = |a: &(f64, f64), b: &(f64, f64)| {
             let change = (b.1 - a.1).abs();
-            change < LEAST || change / soc < 10.0 * (b.0 - a.0).abs() / charge_ah
+            // Three steps of a coarse value are not yet a correction.
+            change < 0.03 || change / soc < 10.0 * (b.0 - a.0).abs() / charge_ah
         };
         let parts: Vec<Vec<(f64, f64)>> = points.chunk_by(goes_on).map(<[_]>::to_vec).collect();
         if parts.len() > MOST + 1 { vec![points] } else { parts }

@@ -40,7 +40,7 @@ pub(super) struct Judge<'d> {
     /// Whether a finding shows that the capacity or the scale of the current is wrong. If so, the resistance, which
     /// scales with the capacity, is not judged.
     pub(super) is_size_explained: bool,
-    /// Whether the reported state of charge confirms the configured capacity.
+    /// Whether the reported state of charge confirms the configured capacity and the sign of the current.
     pub(super) is_capacity_confirmed: bool,
     /// Whether a finding shows that the chemistry or the number of cells is wrong. If so, the voltages cannot be
     /// compared with the cell model.

@@ -25,7 +25,9 @@ pub(super) fn check(judge: &mut Judge<'_>) {
         return;
     }
     let drift = Drift::of(judge);
-    let slope = cell_slope(judge).filter(|slope| slope.certainty() >= 1.0 && slope.r2 >= 0.2);
+    // A charger that lowers the current as the voltage rises looks like an inverted sign.
+    let is_possible = |slope: &Slope| slope.ohm > 0.0 || !judge.is_capacity_confirmed;
+    let slope = cell_slope(judge).filter(|slope| slope.certainty() >= 1.0 && slope.r2 >= 0.2 && is_possible(slope));
     if let Some(slope) = slope {
         if slope.ohm < 0.0 {
             let why = "a discharge lowers the voltage, but here the voltage rises with the configured discharge";
@@ -39,6 +41,8 @@ pub(super) fn check(judge: &mut Judge<'_>) {
         if !judge.is_size_explained && !judge.is_model_wrong {
             resistance(judge, &slope);
         }
+    } else if judge.is_capacity_confirmed {
+        judge.fine("the sign of the current is right: the reported SOC follows it".to_owned());
     } else if let Some(drift) = drift.filter(Drift::is_opposite) {
         let why = "a discharge lowers the voltage (judged from steady current, which is less certain than steps)";
         inverted(judge, signal, drifted_against(&drift), why);

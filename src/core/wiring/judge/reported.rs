@@ -22,8 +22,6 @@ const MOST: f64 = 0.75;
 
 /// Usual ratios of the counted to the configured capacity.
 const USUAL: std::ops::RangeInclusive<f64> = 0.55..=1.3;
-/// A dashboard may show 0 to 100 % for at least this share of the capacity, from at most 25 % to at least 90 %.
-const SHOWN: f64 = 0.65;
 
 /// A reported state of charge: its signal, and its place in the record of the pack's use.
 type Reported<'d> = (&'d SignalPlan, usize);
@@ -62,8 +60,8 @@ pub(super) fn check_charge(judge: &mut Judge<'_>) {
     }
     let Some((signal, slope)) = found else { return too_much(judge, current) };
     let ratio = slope.capacity_ah / pack_ah;
-    judge.is_capacity_confirmed = is_explained(&slope);
-    if judge.is_capacity_confirmed && ratio < 0.0 && !electrical::is_inverted(judge) {
+    judge.is_capacity_confirmed = is_explained(&slope) && ratio > 0.0;
+    if is_explained(&slope) && ratio < 0.0 && !electrical::is_inverted(judge) {
         judge.is_mixed_up = true;
         let seen = format!("{} rises with the configured discharge that {} counts", signal.name, current.name);
         return electrical::inverted(judge, current, seen, "a discharge lowers the state of charge");
@@ -145,7 +143,8 @@ fn size(judge: &mut Judge<'_>, (signal, current): (&SignalPlan, &SignalPlan), sl
     let why = "a worn pack has at least half of its capacity, and a new one hardly more than the label says";
     if current.scale == 1.0 {
         let (key, text) = judge.plan.pack.capacity_change(cell_ah);
-        let may_be_dashboard = ratio < 1.0 && USUAL.contains(&(ratio / SHOWN));
+        // A dashboard may show 25 to 90 % of the capacity as 0 to 100 %.
+        let may_be_dashboard = ratio < 1.0 && USUAL.contains(&(ratio / 0.65));
         let severity = if may_be_dashboard { Severity::Note } else { Severity::Error };
         let title = format!("the capacity is about {measured} Ah, {configured} Ah are configured");
         find(judge, severity, Topic::CellModel, title).seen(seen).why(why).change("pack", key, text).advice(format!(
