@@ -16,6 +16,7 @@ use super::common::progress::{Bar, progress_bar};
 use packwatch_host::failure::{EXIT_CONFIG, Failure};
 
 use crate::io::csv_log::has_table_name;
+use crate::io::log::{LogCounts, LogError};
 use crate::replay::{LogReading, ReplayProgress};
 use crate::wiring::{Severity, Topic, WiringFinding, WiringReport};
 use crate::wiring_check::{self, Interrupt, Survey};
@@ -122,8 +123,7 @@ fn source_name(args: &Args, survey: &Survey) -> String {
 fn again(args: &Args, changed: &mut Survey, survey: &Survey, interrupt: &Interrupt) -> Option<WiringReport> {
     (changed.plan.is_csv, changed.plan.interfaces) = (survey.plan.is_csv, survey.plan.interfaces.clone());
     let reading = args.reading();
-    let result = wiring_check::replay(changed, &args.logs, &reading, args.seconds, interrupt, &mut |_| {});
-    let (mut report, _) = result.ok()?;
+    let (mut report, _) = replay_with_bar(&args.logs, &reading, args.seconds, changed, interrupt).ok()?;
     complete(&mut report, changed);
     Some(report)
 }
@@ -138,6 +138,22 @@ pub(crate) fn judge(config: &Path, logs: &[PathBuf], reading: &LogReading) -> Re
     Ok(report)
 }
 
+fn replay_with_bar(
+    logs: &[PathBuf],
+    reading: &LogReading,
+    seconds: Option<f64>,
+    survey: &Survey,
+    interrupt: &Interrupt,
+) -> Result<(WiringReport, LogCounts), LogError> {
+    let bar = Bar::new(logs);
+    let result = wiring_check::replay(survey, logs, reading, seconds, interrupt, &mut |progress| {
+        let times_real_time = progress.seconds / bar.seconds();
+        bar.show(ReplayProgress { bytes: progress.bytes, frames: progress.frames, times_real_time });
+    });
+    bar.clear();
+    result
+}
+
 fn replay(
     logs: &[PathBuf],
     reading: &LogReading,
@@ -145,13 +161,7 @@ fn replay(
     survey: &Survey,
     interrupt: &Interrupt,
 ) -> Result<WiringReport, Failure> {
-    let bar = Bar::new(logs);
-    let result = wiring_check::replay(survey, logs, reading, seconds, interrupt, &mut |progress| {
-        let times_real_time = progress.seconds / bar.seconds();
-        bar.show(ReplayProgress { bytes: progress.bytes, frames: progress.frames, times_real_time });
-    });
-    bar.clear();
-    let (mut report, counts) = result.map_err(failure)?;
+    let (mut report, counts) = replay_with_bar(logs, reading, seconds, survey, interrupt).map_err(failure)?;
     print_tables(&counts.tables);
     if counts.bad_lines > 0 {
         let first = counts.first_bad_line.unwrap_or_default();

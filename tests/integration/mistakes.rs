@@ -116,6 +116,18 @@ impl Pack {
     }
 }
 
+impl Pack {
+    /// The pack with another log. `change` receives the seconds since the start and a line, and returns the new line.
+    fn with_lines(&self, name: &str, change: impl Fn(f64, &str) -> Option<String>) -> Self {
+        let text = std::fs::read_to_string(&self.log).unwrap();
+        let time_s = |line: &str| line[1..18].parse::<f64>().unwrap() - 1.7e9;
+        let lines = text.lines().filter_map(|line| Some(change(time_s(line), line)? + "\n"));
+        let log = FOLDER.path().join(format!("{name}.log"));
+        std::fs::write(&log, lines.collect::<String>()).unwrap();
+        Self { log, ..self.clone() }
+    }
+}
+
 static FOLDER: LazyLock<tempfile::TempDir> = LazyLock::new(|| tempfile::tempdir().unwrap());
 static LFP: LazyLock<Pack> = LazyLock::new(|| simulated("cells", CELLS.to_owned()));
 static NMC: LazyLock<Pack> = LazyLock::new(|| simulated("total", total()));
@@ -201,7 +213,7 @@ const OF_TOTAL: &[Mistake] = &[
     ("3", &[("cells = 96", "cells = 49")], &["49 cells cannot have this pack voltage"]),
     ("4, fewer", &[("cells = 96", "cells = 86")], &["number of cells", "contradicts the reported SOC"]),
     ("4, more", &[("cells = 96", "cells = 108")], &["number of cells", "contradicts the reported SOC"]),
-    ("14", &[("nmc-graphite", "lfp-graphite")], &["100 to 145 cells", "or pack.chemistry is wrong", "nmc-graphite"]),
+    ("14", &[("nmc-graphite", "lfp-graphite")], &["100 to 145 cells", "pack.chemistry is wrong", "nmc-graphite"]),
 ];
 
 /// Tries the mistakes of a pack. Returns those that are not named.
@@ -227,39 +239,136 @@ fn simulated_mistakes_are_named_and_right_packs_silent() {
     assert!(failed.is_empty(), "{}", failed.join("\n\n"));
 }
 
+/// A right pack of 100 Ah as a vehicle has it: name; chemistry is LFP; state of charge at the start; length (s); current
+/// (A, positive = discharge; NaN = the controller sleeps) at a time (s) and a voltage (V per cell); and the reported state
+/// of charge at a time and a true state of charge.
+type RightPack = (&'static str, bool, f64, u32, fn(f64, f64) -> f64, fn(f64, f64) -> f64);
+
+const RIGHT: &[RightPack] = &[
+    ("constant current", false, 0.3, 9000, |_, _| -11.0, true_soc),
+    ("constant power", false, 0.2, 4500, |_, v| -230.0 / v, true_soc),
+    ("taper", false, 0.1, 1800, |_, v| -830.0 / v * (4.4 - v), true_soc),
+    ("full", true, 0.9, 4000, |_, v| (-1000.0 * (3.6 - v)).clamp(-30.0, 0.0), true_soc),
+    ("dashboard", false, 0.85, 6000, drive_a, |_, soc| 1.25 * (soc - 0.25) / 0.65),
+    ("low dashboard", false, 0.45, 3000, drive_a, |_, soc| (soc - 0.25) / 0.65),
+    ("recalibration", false, 0.9, 6000, drive_a, |t, soc| if t > 2600.0 { soc - 0.08 } else { soc }),
+    ("asleep", false, 0.7, 9000, |t, v| if (2e3..8e3).contains(&t) { f64::NAN } else { drive_a(t, v) }, true_soc),
+    ("storage", true, 0.6, 9000, |t, _| 25.0 * (t / 2000.0).sin(), true_soc),
+    ("rest", true, 0.75, 3600, |_, _| 0.15, true_soc),
+    ("a minute", false, 0.6, 60, drive_a, true_soc),
+    ("coarse SOC", false, 0.9, 5000, drive_a, |_, soc| (200.0 * soc + 1.0).floor() / 200.0),
+];
+
+/// Faults in a right pack: its name, the edits and the words that name the fault.
+const WRONG: &[Mistake] = &[
+    ("constant current", &[("\"charge\"", "\"discharge\"")], &["sign of the current is inverted"]),
+    ("constant power", &[("\"charge\"", "\"discharge\"")], &["sign of the current is inverted"]),
+    ("taper", &[("\"charge\"", "\"discharge\"")], &["sign of the current is inverted"]),
+    ("constant current", &[("BmsStatus.Current", "BmsSummary.Cycles")], &["pack current: the value never changes"]),
+    ("full", &[("lfp-graphite", "nmc-graphite")], &["chemistry contradicts the reported SOC"]),
+    ("low dashboard", &[("nmc-graphite", "lfp-graphite")], &["chemistry contradicts the reported SOC"]),
+    ("dashboard", &[("cells = 96", "cells = 108")], &["number of cells contradicts the reported SOC"]),
+    ("recalibration", &[("ah = 100", "ah = 36")], &["36 Ah are configured"]),
+];
+
+fn true_soc(_: f64, soc: f64) -> f64 {
+    soc
+}
+
+/// Loads and recuperation, for some seconds each.
+fn drive_a(time_s: f64, _: f64) -> f64 {
+    let step = (time_s / 7.0).floor();
+    if step % 5.0 == 0.0 { 0.0 } else { 20.0 + 60.0 * (1.7 * step).sin() }
+}
+
+/// Open-circuit voltage (V) at 0, 10, ... 100 %: typical of the chemistry, and not from the program's model.
+fn ocv_v(is_lfp: bool, soc: f64) -> f64 {
+    let curve = match is_lfp {
+        true => [2.6, 3.2, 3.24, 3.275, 3.287, 3.29, 3.295, 3.318, 3.33, 3.332, 3.45],
+        false => [3.0, 3.45, 3.555, 3.615, 3.655, 3.705, 3.79, 3.88, 3.97, 4.065, 4.185],
+    };
+    let at = (10.0 * soc).clamp(0.0, 9.999);
+    let first = at as usize;
+    // The voltage of a full cell rises steeply.
+    curve[first] + (at - first as f64) * (curve[first + 1] - curve[first]) + 10.0 * (soc - 1.0).max(0.0)
+}
+
+fn right_pack(&(name, is_lfp, start, seconds, current_a, shown): &RightPack) -> Pack {
+    let (config, cells) = if is_lfp { (CELLS.to_owned(), 4.0) } else { (total(), 96.0) };
+    let (mut soc, mut slow_v, mut lines) = (start, 0.0, String::new());
+    let mut voltage_v = ocv_v(is_lfp, soc);
+    for second in 0..seconds {
+        let (time_s, noise) = (f64::from(second), f64::from(second * 7919 % 13) - 6.0);
+        let current = current_a(time_s, voltage_v);
+        let flowing_a = if current.is_nan() { 0.0 } else { current };
+        soc -= flowing_a / 360_000.0;
+        slow_v += (3e-4 * flowing_a - slow_v) / 60.0;
+        voltage_v = ocv_v(is_lfp, soc) - 6e-4 * flowing_a - slow_v + 5e-5 * noise;
+        let code = |value: f64| (value.round() as i64 as u16).to_le_bytes().map(|byte| format!("{byte:02X}")).concat();
+        let status = code(-10.0 * current) + &code(100.0 * cells * voltage_v);
+        let temperatures = code(2981.0) + &code(3121.0);
+        let summary = code(1000.0 * shown(time_s, soc)) + "60" + &code(131.0);
+        let singles: String =
+            (0..4).map(|n| code(1000.0 * voltage_v + f64::from(n) * (1.0 + 0.02 * flowing_a))).collect();
+        let frames =
+            [("100", status), ("101", temperatures), ("102", summary), ("110", singles), ("3F0", "00".to_owned())];
+        let sent = frames.into_iter().filter(|(id, _)| !current.is_nan() || *id == "3F0");
+        lines.extend(sent.map(|(id, data)| format!("({}.000000) can0 {id}#{data:0<16}\n", 1_700_000_000 + second)));
+    }
+    let log = FOLDER.path().join(format!("{name}.log"));
+    std::fs::write(&log, lines).unwrap();
+    Pack { files: BTreeMap::from([("pack.dbc".to_owned(), DBC.to_owned())]), config, log, arguments: &[] }
+}
+
+#[test]
+fn right_packs_of_vehicles_are_silent_and_their_faults_named() {
+    let mut failed = Vec::new();
+    for right in RIGHT {
+        let pack = right_pack(right);
+        let wrong: Vec<Mistake> = WRONG.iter().filter(|mistake| mistake.0 == right.0).copied().collect();
+        failed.extend(unnamed(right.0, &pack, &wrong));
+        if right.0 == "dashboard" {
+            let is_stopped = |time_s: f64, line: &str| (2000.0..4000.0).contains(&time_s) && line.contains(" 100#");
+            let stopped = pack.with_lines("stopped", |time_s, line| match is_stopped(time_s, line) {
+                true => Some(format!("{} can0 100#0000{}", &line[..19], &line[33..])),
+                false => Some(line.to_owned()),
+            });
+            let (code, text) = stopped.doctor(&[]);
+            assert!(code == 1 && text.contains("it stops while the pack is in use"), "{text}");
+        }
+    }
+    assert!(failed.is_empty(), "{}", failed.join("\n\n"));
+}
+
 #[test]
 fn hole_in_log_is_named_with_its_times() {
     // 2 h of the log, or of the current alone, are missing.
     for (is_whole, words) in [(true, "a stretch of 2 h is missing in the log"), (false, "pack current: no reading for")]
     {
-        let mut pack = LFP.clone();
-        let text = std::fs::read_to_string(&pack.log).unwrap();
-        let is_kept = |line: &&str| {
-            let time = line[1..11].parse::<i64>().unwrap() - 1_700_000_000;
-            !(2000..9200).contains(&time) || !is_whole && !line.contains(" 100#")
-        };
-        pack.log = FOLDER.path().join(format!("hole{is_whole}.log"));
-        std::fs::write(&pack.log, text.lines().filter(is_kept).map(|line| format!("{line}\n")).collect::<String>())
-            .unwrap();
+        let is_kept =
+            |time_s: f64, line: &str| !(2000.0..9200.0).contains(&time_s) || !is_whole && !line.contains(" 100#");
+        let pack = LFP.with_lines("hole", |time_s, line| is_kept(time_s, line).then(|| line.to_owned()));
         let (code, text) = pack.doctor(&[]);
         assert!(code == 1 && text.contains(words) && text.contains("to 2.556 h after the first frame"), "{text}");
     }
 }
 
 #[test]
-fn current_without_sign_is_named() {
-    let mut pack = LFP.clone();
-    let text = std::fs::read_to_string(&pack.log).unwrap();
-    let magnitude = |line: &str| {
-        let Some((before, data)) = line.split_once("100#") else { return format!("{line}\n") };
+fn current_without_sign_or_direction_is_named() {
+    let pack = LFP.with_lines("magnitude", |_, line| {
+        let Some((before, data)) = line.split_once("100#") else { return Some(line.to_owned()) };
         let low = u16::from_str_radix(&data[..2], 16).unwrap() + 256 * u16::from_str_radix(&data[2..4], 16).unwrap();
         let bytes = low.cast_signed().unsigned_abs().to_le_bytes();
-        format!("{before}100#{:02X}{:02X}{}\n", bytes[0], bytes[1], &data[4..])
-    };
-    pack.log = FOLDER.path().join("magnitude.log");
-    std::fs::write(&pack.log, text.lines().map(magnitude).collect::<String>()).unwrap();
+        Some(format!("{before}100#{:02X}{:02X}{}", bytes[0], bytes[1], &data[4..]))
+    });
     let (code, text) = pack.doctor(&[("\"charge\"", "\"discharge\"")]);
     assert!(code == 1 && text.contains("the current is never negative, but the"), "{text}");
+    let sign = "\"discharge\"\nsign = { signal = \"BmsCharger.Charging\", charge = [1] }";
+    let charger = "\nBO_ 259 BmsCharger: 8 BMS\n SG_ Charging : 0|1@1+ (1,0) [0|1] \"\" X\nBO_ 272 ";
+    let (code, text) = pack.doctor(&[("\"charge\"", sign), ("\nBO_ 272 ", charger)]);
+    for words in ["direction of the current: configured, never received", "never with the direction of the current"] {
+        assert!(code == 1 && text.contains(words) && !text.contains("inverted"), "{text}");
+    }
 }
 
 /// A folder of further measured data, beside the folder of measured data.

@@ -119,7 +119,8 @@ fn changes(changes: &[Change], paint: Paint, page: &mut String) {
             Some(now) => format!("{} = {now}", change.key),
             None => format!("{} is not set", change.key),
         };
-        page.push_str(&format!("{}{}  [{}]\n", paint.dim(&format!("  {:8}", "change")), place, change.table));
+        let label = if change.is_alternative { "or" } else { "change" };
+        page.push_str(&format!("{}{}  [{}]\n", paint.dim(&format!("  {label:8}")), place, change.table));
         page.push_str(&format!("{:INDENT$}{}\n", "", paint.with("31", &format!("- {now}"))));
         page.push_str(&format!("{:INDENT$}{}\n", "", paint.with("32", &proposal(change))));
     }
@@ -162,8 +163,8 @@ mod tests {
     use crate::wiring::Topic;
 
     fn change(proposed: &str) -> Change {
-        let place = Some("pack.toml:7".to_owned());
-        Change { table: "pack".to_owned(), key: "cells".to_owned(), proposed: proposed.to_owned(), place, now: None }
+        let (table, key) = ("pack".to_owned(), "cells".to_owned());
+        Change { table, key, proposed: proposed.to_owned(), place: Some("pack.toml:7".to_owned()), ..Change::default() }
     }
 
     #[test]

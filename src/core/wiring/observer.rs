@@ -102,7 +102,7 @@ pub struct WiringObserver {
     groups: ParameterGroups,
     group_senders: GroupSenders,
     /// Latest direction of a current that is sent as a magnitude, with its time: 1 = discharge, -1 = charge, `None` =
-    /// unknown. `None` until there is a reading.
+    /// unknown. `None` if no direction is configured.
     direction: Option<(Timestamp, Option<f64>)>,
     guards: Guards,
     pub(crate) protected: BTreeMap<(BusIndex, CanId), ProtectionStats>,
@@ -159,7 +159,7 @@ impl WiringObserver {
         Self {
             groups: ParameterGroups::new(plan.signals.iter().map(|signal| &signal.binding)),
             group_senders: GroupSenders::default(),
-            direction: None,
+            direction: plan.has_direction().then(|| (Timestamp::default(), None)),
             listener: Listener::new(&answers),
             by_question,
             buses: plan.interfaces.iter().map(bus).collect(),

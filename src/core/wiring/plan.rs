@@ -97,12 +97,16 @@ pub struct SignalPlan {
     pub offset: f64,
 }
 
+/// Rounds to two significant digits, because the capacity of a used pack is not exact.
+pub(super) fn two_digits(value: f64) -> f64 {
+    format!("{value:.1e}").parse().unwrap_or(value)
+}
+
 impl PackPlan {
     /// The key of `[pack]` that states the capacity, and its value for cells of `cell_ah` (Ah).
     pub(super) fn capacity_change(&self, cell_ah: f64) -> (&'static str, String) {
         match self.label {
-            // Two digits, because the capacity of a used pack is not exact.
-            Some(_) => ("rated_capacity_ah", format!("{cell_ah:.1e}").parse::<f64>().unwrap_or(cell_ah).to_string()),
+            Some(_) => ("rated_capacity_ah", two_digits(cell_ah).to_string()),
             None => (self.model_change().0, self.model_change().1.to_owned()),
         }
     }
@@ -250,6 +254,11 @@ impl Plan {
     /// The signal of a witness.
     pub(super) fn witness(&self, Witness { is_configured, index }: Witness) -> &SignalPlan {
         if is_configured { &self.signals[index] } else { &self.unconfigured[index] }
+    }
+
+    /// Whether the current is sent as a magnitude and a direction.
+    pub(super) fn has_direction(&self) -> bool {
+        self.signals.iter().any(|signal| signal.binding.channel == Channel::CurrentDirection)
     }
 
     /// Age from which a reading of the channel is stale (s).

@@ -68,7 +68,7 @@ pub enum Topic {
 }
 
 /// A line of the configuration to change.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
 pub struct Change {
     /// Name of the table, for example `input.current`.
     pub table: String,
@@ -80,6 +80,8 @@ pub struct Change {
     pub place: Option<String>,
     /// Present value in the file; `None` if the key is not set.
     pub now: Option<String>,
+    /// Whether this change replaces the changes before it in the list, because only one of them is right.
+    pub is_alternative: bool,
 }
 
 /// One finding.
@@ -140,7 +142,15 @@ impl WiringFinding {
 
     pub(super) fn change(&mut self, table: &str, key: &str, proposed: impl Into<String>) -> &mut Self {
         let (table, key) = (table.to_owned(), key.to_owned());
-        self.changes.push(Change { table, key, proposed: proposed.into(), place: None, now: None });
+        self.changes.push(Change { table, key, proposed: proposed.into(), ..Change::default() });
+        self
+    }
+
+    /// Adds a change that replaces the changes before it.
+    pub(super) fn alternative(&mut self, table: &str, key: &str, proposed: impl Into<String>) -> &mut Self {
+        let is_alternative = !self.changes.is_empty();
+        let (table, key) = (table.to_owned(), key.to_owned());
+        self.changes.push(Change { table, key, proposed: proposed.into(), is_alternative, ..Change::default() });
         self
     }
 

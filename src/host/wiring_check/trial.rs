@@ -2,15 +2,15 @@
 //! input again.
 //!
 //! In: the report and a function that judges the input with another configuration. Out: each finding states whether its
-//! change removes it. A change that does not help is removed from the report, so that nobody follows it. Nothing is
-//! written.
+//! change alone removes it without another error or warning. Alternatives are tried one by one. A change that does not
+//! help is removed from the report, so that nobody follows it. Nothing is written.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use super::Survey;
 use super::survey::survey_with;
-use crate::wiring::{Change, Severity, WiringReport};
+use crate::wiring::{Change, Severity, Topic, WiringFinding, WiringReport};
 
 /// Maximum number of findings whose changes are tried, because every trial reads the logs again.
 const MAX_TRIALS: usize = 4;
@@ -22,35 +22,91 @@ pub fn try_changes(
     report: &mut WiringReport,
     judge: &mut dyn FnMut(&mut Survey) -> Option<WiringReport>,
 ) {
-    let errors = errors(report);
     let faults = super::survey(config).map_or(0, |survey| survey.faults.len());
-    let is_tried = |index: &usize| {
-        let finding = &report.findings[*index];
-        finding.severity != Severity::Note && !finding.changes.is_empty() && finding.changes.iter().all(is_exact)
-    };
-    let tried: Vec<usize> = (0..report.findings.len()).filter(is_tried).take(MAX_TRIALS).collect();
-    for index in tried {
-        let finding = &report.findings[index];
-        let Some(mut survey) = changed(config, &finding.changes) else { continue };
-        let Some(other) = judge(&mut survey) else { continue };
-        let remains =
-            other.findings.iter().any(|other| other.title == finding.title && other.severity == finding.severity);
-        let is_worse = self::errors(&other) > errors || survey.faults.len() > faults;
-        let finding = &mut report.findings[index];
-        finding.is_solved = Some(!remains && !is_worse);
-        if remains || is_worse {
-            let lines: Vec<String> = finding.changes.drain(..).map(|c| format!("{} = {}", c.key, c.proposed)).collect();
-            let text = format!("{} was tried and does not help", lines.join(", "));
-            let advice = finding.advice.take().into_iter().chain([text]);
-            finding.advice = Some(advice.collect::<Vec<_>>().join("; "));
+    let before = counts(report);
+    let mut left = MAX_TRIALS;
+    for finding in report.findings.iter_mut().filter(|finding| finding.severity != Severity::Note) {
+        let own = subject(finding);
+        let mut is_solved = Some(true).filter(|_| !finding.changes.is_empty());
+        for group in std::mem::take(&mut finding.changes).chunk_by(|_, next| !next.is_alternative) {
+            let is_exact = left > 0 && group.iter().all(is_exact);
+            let outcome = match if is_exact { changed(config, group) } else { None } {
+                Some(survey) if survey.faults.len() > faults => Outcome::Useless,
+                // Without a valid configuration, not every check runs.
+                Some(mut survey) if survey.faults.is_empty() => {
+                    left -= 1;
+                    judge(&mut survey).map_or(Outcome::Untried, |other| Outcome::of(&before, &own, &other))
+                }
+                _ => Outcome::Untried,
+            };
+            is_solved = match outcome {
+                Outcome::Untried => None,
+                Outcome::Exchanged(_) => is_solved.and(Some(false)),
+                Outcome::Solved | Outcome::Useless => is_solved,
+            };
+            keep(finding, group, outcome);
+        }
+        finding.is_solved = is_solved.map(|is_solved| is_solved && !finding.changes.is_empty());
+    }
+}
+
+/// Result of the trial of one proposal.
+enum Outcome {
+    Untried,
+    /// The finding disappears, and no other appears.
+    Solved,
+    /// The finding disappears, but another one with this title appears.
+    Exchanged(String),
+    Useless,
+}
+
+impl Outcome {
+    fn of(before: &BTreeMap<Subject, usize>, own: &Subject, other: &WiringReport) -> Self {
+        let after = counts(other);
+        let count = |counts: &BTreeMap<Subject, usize>, subject: &Subject| counts.get(subject).copied().unwrap_or(0);
+        let is_new = |finding: &&WiringFinding| {
+            let subject = subject(finding);
+            finding.severity != Severity::Note && count(&after, &subject) > count(before, &subject)
+        };
+        if count(&after, own) >= count(before, own) {
+            Self::Useless
+        } else {
+            other.findings.iter().find(is_new).map_or(Self::Solved, |new| Self::Exchanged(new.title.clone()))
         }
     }
 }
 
-fn errors(report: &WiringReport) -> usize {
-    report.findings.iter().filter(|finding| finding.severity == Severity::Error).count()
+/// Puts tried changes back into a finding, or states why they do not help.
+fn keep(finding: &mut WiringFinding, changes: &[Change], outcome: Outcome) {
+    let lines = changes.iter().map(|c| format!("{} = {}", c.key, c.proposed)).collect::<Vec<_>>().join(", ");
+    let text = match &outcome {
+        Outcome::Untried | Outcome::Solved => None,
+        Outcome::Exchanged(title) => Some(format!("{lines} was tried; then another finding appears: {title}")),
+        Outcome::Useless => Some(format!("{lines} was tried and does not help")),
+    };
+    finding.advice = finding.advice.take().into_iter().chain(text).reduce(|all, more| format!("{all}; {more}"));
+    if !matches!(outcome, Outcome::Useless) {
+        let is_first = finding.changes.is_empty();
+        finding.changes.extend_from_slice(changes);
+        finding.changes[..1].iter_mut().for_each(|change| change.is_alternative &= !is_first);
+    }
 }
 
+/// What a finding is about: its topic and the table of its first change.
+type Subject = (Topic, String);
+
+fn subject(finding: &WiringFinding) -> Subject {
+    (finding.topic, finding.changes.first().map_or_else(String::new, |change| change.table.clone()))
+}
+
+/// Number of errors and warnings about each subject.
+fn counts(report: &WiringReport) -> BTreeMap<Subject, usize> {
+    let mut counts = BTreeMap::new();
+    for finding in report.findings.iter().filter(|finding| finding.severity != Severity::Note) {
+        *counts.entry(subject(finding)).or_default() += 1;
+    }
+    counts
+}
 /// Whether the change states a value, and not only a description.
 fn is_exact(change: &Change) -> bool {
     change.place.is_some() && toml::from_str::<toml::Table>(&format!("{} = {}", change.key, change.proposed)).is_ok()
@@ -105,7 +161,28 @@ mod tests {
 
     fn change(now: Option<&str>) -> Change {
         let (table, key) = ("pack".to_owned(), "cells".to_owned());
-        Change { table, key, proposed: "98".to_owned(), place: None, now: now.map(str::to_owned) }
+        Change { table, key, proposed: "98".to_owned(), now: now.map(str::to_owned), ..Change::default() }
+    }
+
+    fn report(titles: &[(Severity, Topic, &str)]) -> WiringReport {
+        let mut report = WiringReport::default();
+        for (severity, topic, title) in titles {
+            report.add(WiringFinding::new(*severity, *topic, *title));
+        }
+        report
+    }
+
+    #[test]
+    fn proposal_is_solved_only_without_other_finding() {
+        let sign = (Severity::Error, Topic::CurrentSign, "5 sigma");
+        let unit = (Severity::Warning, Topic::Unit, "off");
+        let outcome = |after: &[(Severity, Topic, &str)]| {
+            Outcome::of(&counts(&report(&[sign])), &(Topic::CurrentSign, String::new()), &report(after))
+        };
+        assert!(matches!(outcome(&[]), Outcome::Solved));
+        assert!(matches!(outcome(&[(Severity::Note, Topic::Noise, "noisy")]), Outcome::Solved));
+        assert!(matches!(outcome(&[unit]), Outcome::Exchanged(title) if title == "off"));
+        assert!(matches!(outcome(&[(Severity::Warning, Topic::CurrentSign, "4 sigma")]), Outcome::Useless));
     }
 
     #[test]

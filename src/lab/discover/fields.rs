@@ -19,7 +19,7 @@ use crate::can::CanId;
 use crate::can::dbc::{Database, FrameFormat, Message, MuxCondition, Signal};
 use crate::can::signal::{ByteOrder, SignalLayout, ValueType};
 use crate::can::unit::Quantity;
-use crate::wiring::evidence::{Series, Slope};
+use crate::wiring::evidence::{Series, Slope, windows};
 
 /// Maximum number of payloads that are evaluated per message, or per page of a message.
 const MAX_PAYLOADS: usize = 1500;
@@ -91,7 +91,8 @@ impl<'a> Samples<'a> {
             // Taking every n-th payload might drop whole pages.
             payloads.iter().take(MAX_PAYLOADS * pages.len()).collect()
         } else {
-            payloads.iter().step_by(payloads.len().div_ceil(MAX_PAYLOADS).max(1)).collect()
+            // The steps from payload to payload show a current. Over longer times, the charge changes the voltage too.
+            windows(payloads.iter().collect(), MAX_PAYLOADS, 8.0)
         };
         Self { key, bytes, pages, payloads }
     }
@@ -209,12 +210,18 @@ fn currents<'a>(
 ) -> Vec<LogSignal> {
     let mut found: Vec<(f64, LogSignal)> = Vec::new();
     for samples in messages {
-        for layout in layouts(samples.bytes, true).into_iter().chain(layouts(samples.bytes, false)) {
-            let codes = samples.values(&layout, None);
+        let all = layouts(samples.bytes, true).into_iter().chain(layouts(samples.bytes, false));
+        let read = all.map(|layout| (layout, samples.values(&layout, None)));
+        let read: Vec<_> = read.filter(|(_, codes)| !codes.is_constant() && !codes.is_counter()).collect();
+        // The lowest and the highest cell, for example.
+        let repeats = |codes: &Series| voltages.iter().any(|voltage| is_reading_of(codes, &voltage.series));
+        let taken: Vec<SignalLayout> =
+            read.iter().filter(|(_, codes)| repeats(codes)).map(|(layout, _)| *layout).collect();
+        for (layout, codes) in read {
             // Without the highest bit, the unsigned field equals the signed field.
             let is_same =
                 layout.value_type == ValueType::Unsigned && codes.extent.max < f64::from(layout.length_bits - 1).exp2();
-            if codes.is_constant() || codes.is_counter() || is_same {
+            if is_same || taken.iter().any(|taken| taken.overlaps(&layout)) {
                 continue;
             }
             let Some(zero) = codes.zero_code(1.0) else { continue };
@@ -233,11 +240,6 @@ fn currents<'a>(
             };
             let factor = CURRENT_SCALES.iter().copied().min_by(|a, b| distance(a).total_cmp(&distance(b)));
             let factor = factor.unwrap_or(1.0);
-            if zero != 0.0 && PACK_SCALES.iter().any(|scale| (codes.extent.mean() * scale / mean_v - 1.0).abs() < 0.05)
-            {
-                // Another reading of the voltage.
-                continue;
-            }
             let layout = SignalLayout { factor, offset: -zero * factor, ..layout };
             let series = samples.values(&layout, None);
             let name = format!("Current_{}", place(&layout));
@@ -246,6 +248,16 @@ fn currents<'a>(
     }
     found.sort_by(|a, b| b.0.total_cmp(&a.0).then_with(|| a.1.name.cmp(&b.1.name)));
     found.into_iter().take(12).map(|(_, signal)| signal).collect()
+}
+
+/// Whether the codes are another reading of the voltage: the values are equal at a common scale, and change in
+/// proportion. The codes of a current with an offset may have the same values, but the resistance sets their changes.
+fn is_reading_of(codes: &Series, voltage: &Series) -> bool {
+    let scale = voltage.extent.mean() / codes.extent.mean();
+    let common = PACK_SCALES.iter().chain(CELL_FORMS[0].1).any(|common| (scale / common - 1.0).abs() < 0.05);
+    // The slope is that of a resistance: negative if both rise.
+    let slope = Slope::between(voltage, codes).filter(|slope| slope.correlation() >= 0.5);
+    common && slope.is_some_and(|slope| (0.5..2.0).contains(&(-slope.ohm / scale)))
 }
 
 /// Whether a field overlaps a layout in the message `id`, on any interface: gateways repeat messages on other

@@ -106,7 +106,7 @@ mod tests {
         assert_eq!("16s, lfp-graphite".parse::<PackLabel>().unwrap().pack_v().map(|v| v.1.round()), Some(60.0));
         assert_eq!("".parse(), Ok(PackLabel::default()));
         for (text, part) in
-            [("pb", "lfp"), ("0s", "1 to 1024".split(' ').next().unwrap()), ("-3Ah", "64Ah"), ("1s:2s", "twice")]
+            [("pb", "lfp"), ("0s", "1s to 1024s"), ("1025s", "1s to 1024s"), ("-3Ah", "64Ah"), ("1s:2s", "twice")]
         {
             let error = text.parse::<PackLabel>().unwrap_err();
             assert!(error.contains(part), "{text}: {error}");

@@ -66,9 +66,9 @@ enum LabelUnit {
 const PACK: &str = "batt akku pack bms traction hvb =hv accumulator";
 /// Words that indicate other devices or the 12 V battery.
 const ELSEWHERE: &str = "12v twelvevolt =lv aux starter dcdc =dc =ac motor inverter invrt phase obc evse ptc heater htr \
-    compressor hvac cabin ambient coolant tpms tire front rear link solar pump fan oil igbt fet pcb cpu \
-    pilot connector pin inlet outlet capacitor charger plug port climate freezer stator brake trailer \
-    screen bus line isolation relay coil contactor cont";
+    compressor hvac cabin ambient coolant tpms tire =front =rear =link solar pump =fan =oil igbt =fet =pcb =cpu \
+    pilot connector =pin =inlet =outlet capacitor charger plug =port climate freezer stator brake trailer \
+    screen =bus =line isolation relay =coil contactor";
 /// Words that indicate the battery controller's own electronics. They are warmer than the cells and follow the load.
 const ELECTRONICS: &str =
     "=mos =tmos mosfet board shunt heatsink heat_sink =afe =ic =mcu chip electronic balanc resist tube";
@@ -188,7 +188,7 @@ impl SignalLabel {
 
     /// Whether the name says that a temperature belongs to another device or to the controller's electronics.
     pub fn is_of_other_part(&self) -> bool {
-        self.has(ELSEWHERE) || self.has(ELECTRONICS) && !self.says_cell()
+        !self.says_cell() && (self.has(ELSEWHERE) || self.has(ELECTRONICS))
     }
 
     /// Whether the name says that the value is a maximum or minimum.
@@ -311,7 +311,13 @@ mod tests {
     fn words_of_other_devices_are_recognised() {
         let label = |name: &str| SignalLabel::new("", name, "");
         assert!(label("Voltage_12V").has(ELSEWHERE) && label("RearMotorCurrent126").has(ELSEWHERE));
-        assert!(!label("SmoothBattCurrent132").has(ELSEWHERE) && !label("VBatt").has(ELSEWHERE));
+        for own in ["SmoothBattCurrent132", "VBatt", "BattSpineTemp", "Container_Temp", "BaselineTemp", "Supported"] {
+            assert!(!label(own).has(ELSEWHERE), "{own}");
+        }
+        for cells in ["Busbar temperature of cell 3", "CellTempFront", "RearCell_Temp"] {
+            assert!(!label(cells).is_of_other_part(), "{cells}");
+        }
+        assert!(label("BatteryInletTemp").is_of_other_part() && label("HV_Bus_Temp").is_of_other_part());
         assert!(label("SOCave292").says_soc() && !label("UI_enableVinAssociation").says_soc());
     }
 

@@ -25,6 +25,6 @@ pub(super) mod usage;
 
 pub use label::{PackQuantity, Score, SignalLabel};
 pub use sample::{Extent, ThinnedSample};
-pub use series::{Series, UnusableCounts, recorded_value};
+pub use series::{Series, UnusableCounts, recorded_value, windows};
 pub use slope::Slope;
 pub use usage::{HIDDEN_SOC, STEADY_A};

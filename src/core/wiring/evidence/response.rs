@@ -136,6 +136,8 @@ pub(crate) struct VoltageResponse {
     previous: Option<BlockMean>,
     open_run: Option<OpenRun>,
     steps: Vec<CurrentStep>,
+    /// Largest absolute current of a block (A).
+    largest_a: f64,
     /// The largest absolute voltage steps (V), whatever the current did, largest first.
     voltage_steps_v: [f64; 3],
     pub(crate) runs: Vec<SteadyRun>,
@@ -196,6 +198,7 @@ impl VoltageResponse {
         self.equal_cells.push(&cells_v);
         let Some(voltage_v) = median(cells_v.iter().copied()) else { return };
         let mean = BlockMean { time: from, current_a, voltage_v, cells_v };
+        self.largest_a = self.largest_a.max(current_a.abs());
         let near = self.previous.take().filter(|before| (0.0..=MAX_GAP_S).contains(&mean.time.since(before.time)));
         match near {
             Some(before) => self.note_step(&before, &mean),
@@ -268,6 +271,11 @@ impl VoltageResponse {
     /// noise is.
     fn slope_over(&self, voltage_v: impl Fn(&CurrentStep) -> Option<f64>) -> Option<Slope> {
         let largest = self.steps.iter().map(|step| step.current_a.abs()).fold(0.0, f64::max);
+        // A charger of constant power, or one that tapers, changes the current slowly as the voltage rises: then the
+        // voltage drives the current.
+        if largest < 0.05 * self.largest_a {
+            return None;
+        }
         let points = |least_a: f64| {
             let steps = self.steps.iter().filter(move |step| step.current_a.abs() >= least_a);
             steps.filter_map(|step| Some((step.current_a, voltage_v(step)?))).filter(|(_, v)| v.is_finite())

@@ -21,6 +21,10 @@ pub struct UnusableCounts {
     pub(crate) not_finite: u64,
 }
 
+/// Shortest missing stretch of a signal (s), and its shortest length in periods of the signal.
+const MISSING_S: f64 = 60.0;
+const MISSING_PERIODS: f64 = 20.0;
+
 /// Statistics of one signal.
 #[derive(Debug, Clone, Default)]
 pub struct Series {
@@ -39,10 +43,14 @@ pub struct Series {
     /// Time between two readings (s).
     pub(crate) gaps: ThinnedSample,
     pub(crate) loss: LossCounter,
+    /// Longest gap that is not a missing stretch (s).
     pub(crate) longest_gap_s: f64,
-    /// Begin of the longest gap.
-    pub(crate) longest_gap_from: Option<Timestamp>,
-    /// Number of gaps that are longer than `max_age_s`: a reading became stale before the next reading.
+    /// Longest missing stretch: begin and length (s).
+    pub(crate) longest_missing: Option<(Timestamp, f64)>,
+    /// Sum of the missing stretches (s).
+    pub(crate) missing_s: f64,
+    /// Number of gaps that are longer than `max_age_s` and not missing stretches: a reading became stale before the next
+    /// reading.
     pub(crate) stale_gaps: u64,
     /// Absolute changes from one value to the next.
     pub(crate) changes: ThinnedSample,
@@ -75,6 +83,10 @@ impl Series {
 
     /// Creates the statistics of a recorded signal from its values and their times (s).
     pub fn of(readings: impl Iterator<Item = (f64, Result<f64, Fault>)>) -> Self {
+        // 4096 values suffice for a correlation, and samples of this size fit into memory for thousands of signals.
+        const MOST: usize = 4096;
+        // A load changes within some tenths of a second.
+        const FINE_S: f64 = 0.5;
         let mut series = Self::default();
         let mut all = Vec::new();
         for (time_s, value) in readings {
@@ -87,7 +99,7 @@ impl Series {
                 Ok(_) | Err(_) => series.unusable.short += 1,
             }
         }
-        let (times_s, values) = windows(all).into_iter().unzip();
+        let (times_s, values) = windows(all, MOST, FINE_S).into_iter().unzip();
         (series.times_s, series.values) = (ThinnedSample::of(times_s), ThinnedSample::of(values));
         series
     }
@@ -139,12 +151,19 @@ impl Series {
     fn note_gap(&mut self, time: Timestamp, max_age_s: f64) -> Option<f64> {
         let gap_s = self.last_time.map(|last| time.since(last).max(0.0));
         if let Some(gap_s) = gap_s {
+            // The sender slept, or the signal was left out.
+            let is_missing = gap_s > MISSING_S && gap_s > MISSING_PERIODS * self.period_s().unwrap_or(f64::INFINITY);
             self.gaps.push(gap_s);
             self.loss.push(gap_s);
-            if gap_s > self.longest_gap_s {
-                (self.longest_gap_s, self.longest_gap_from) = (gap_s, self.last_time);
+            if is_missing {
+                self.missing_s += gap_s;
+                let is_longest = self.longest_missing.is_none_or(|(_, longest_s)| gap_s > longest_s);
+                self.longest_missing =
+                    self.last_time.filter(|_| is_longest).map(|from| (from, gap_s)).or(self.longest_missing);
+            } else {
+                self.longest_gap_s = self.longest_gap_s.max(gap_s);
+                self.stale_gaps += u64::from(gap_s > max_age_s);
             }
-            self.stale_gaps += u64::from(gap_s > max_age_s);
         }
         self.last_time = Some(time);
         gap_s
@@ -233,26 +252,23 @@ impl Series {
     }
 }
 
-/// Thins readings. Fast readings are first thinned to a few per second. Then whole windows of time are kept, so that the
-/// steps from reading to reading stay in the sample however long the log is, and all signals keep the same times.
-fn windows(mut readings: Vec<(f64, f64)>) -> Vec<(f64, f64)> {
-    // 4096 values suffice for a correlation, and samples of this size fit into memory for thousands of signals.
-    const MOST: usize = 4096;
+/// Thins readings to at most `most`. Fast readings are first thinned to one per `fine_s` (s). Then whole windows of time
+/// are kept, so that the steps from reading to reading stay in the sample however long the log is, and all signals keep
+/// the same times.
+pub fn windows<T>(mut readings: Vec<(f64, T)>, most: usize, fine_s: f64) -> Vec<(f64, T)> {
     // Longer than the period of most signals, and short enough that fast signals keep many windows.
-    const WINDOW_S: f64 = 8.0;
-    // A load changes within some tenths of a second.
-    const FINE_S: f64 = 0.5;
+    let window_s = 16.0 * fine_s;
     let span_s = readings.first().zip(readings.last()).map_or(0.0, |((first_s, _), (last_s, _))| last_s - first_s);
     let period_s = span_s / readings.len().max(1) as f64;
-    let finest = if period_s > 0.0 { (FINE_S / period_s) as usize } else { 1 };
-    let stride = readings.len().div_ceil(MOST).min(finest).max(1);
+    let finest = if period_s > 0.0 { (fine_s / period_s) as usize } else { 1 };
+    let stride = readings.len().div_ceil(most).min(finest).max(1);
     readings = readings.into_iter().step_by(stride).collect();
     let mut mask = 0_u64;
-    while readings.len() > MOST && mask < u64::MAX >> 1 {
+    while readings.len() > most && mask < u64::MAX >> 1 {
         mask = mask << 1 | 1;
-        readings.retain(|(time_s, _)| (time_s / WINDOW_S) as u64 & mask == 0);
+        readings.retain(|(time_s, _)| (time_s / window_s) as u64 & mask == 0);
     }
-    let stride = readings.len().div_ceil(MOST).max(1);
+    let stride = readings.len().div_ceil(most).max(1);
     readings.into_iter().step_by(stride).collect()
 }
 

@@ -5,7 +5,7 @@
 //! from one moment to the next (A h, positive = discharge), so thinning loses no charge. A gap begins a new stretch,
 //! because the charge that flowed in the gap is unknown. Assumption: a reading of the current holds until the next.
 
-use crate::filter::median;
+use crate::filter::{ends, median};
 use crate::quantity::Timestamp;
 
 /// Maximum number of moments that are kept.
@@ -142,15 +142,39 @@ pub(crate) struct ChargeSlope {
     pub(crate) charge_range_ah: f64,
 }
 
+/// Pairs of charge (Ah) and reported state of charge. Each stretch ends where the controller corrects its value: the
+/// value jumps much further than the charge.
+fn stretches(moments: &[Moment], place: usize) -> Vec<Vec<(f64, f64)>> {
+    /// More jumps than this are the steps of a value that is sent rarely.
+    const MOST: usize = 3;
+    let points = |stretch: &[Moment]| -> Vec<(f64, f64)> {
+        let all = stretch.iter().map(|moment| (moment.charge_ah, moment.reported[place]));
+        all.filter(|(_, soc)| soc.is_finite()).collect()
+    };
+    let split = |points: Vec<(f64, f64)>| {
+        let range = |value: fn(&(f64, f64)) -> f64| {
+            let (low, high) = ends(points.iter().map(value));
+            (high - low).max(1e-9)
+        };
+        let (charge_ah, soc) = (range(|point| point.0), range(|point| point.1));
+        let goes_on = |a: &(f64, f64), b: &(f64, f64)| {
+            let change = (b.1 - a.1).abs();
+            // Three steps of a coarse value are not yet a correction.
+            change < 0.03 || change / soc < 10.0 * (b.0 - a.0).abs() / charge_ah
+        };
+        let parts: Vec<Vec<(f64, f64)>> = points.chunk_by(goes_on).map(<[_]>::to_vec).collect();
+        if parts.len() > MOST + 1 { vec![points] } else { parts }
+    };
+    moments.chunk_by(|a, b| a.stretch == b.stretch).flat_map(|stretch| split(points(stretch))).collect()
+}
+
 impl ChargeSlope {
     /// Fits the charge against the reported value `place`; `None` without values.
     pub(crate) fn of(moments: &[Moment], place: usize) -> Option<Self> {
         let (mut qq, mut qs, mut ss) = (0.0, 0.0, 0.0);
         let (mut range, mut distinct, mut charge_range_ah) = (0.0_f64, 0, 0.0_f64);
         let (mut rise, mut fall) = (0.0_f64, 0.0_f64);
-        for stretch in moments.chunk_by(|a, b| a.stretch == b.stretch) {
-            let points = stretch.iter().map(|moment| (moment.charge_ah, moment.reported[place]));
-            let points: Vec<(f64, f64)> = points.filter(|(_, s)| s.is_finite()).collect();
+        for points in stretches(moments, place) {
             let n = points.len() as f64;
             let (sum_q, sum_s) = points.iter().fold((0.0, 0.0), |(q, s), point| (q + point.0, s + point.1));
             for (q, s) in &points {

@@ -40,6 +40,8 @@ pub(super) struct Judge<'d> {
     /// Whether a finding shows that the capacity or the scale of the current is wrong. If so, the resistance, which
     /// scales with the capacity, is not judged.
     pub(super) is_size_explained: bool,
+    /// Whether the reported state of charge confirms the configured capacity and the sign of the current.
+    pub(super) is_capacity_confirmed: bool,
     /// Whether a finding shows that the chemistry or the number of cells is wrong. If so, the voltages cannot be
     /// compared with the cell model.
     pub(super) is_model_wrong: bool,
@@ -85,6 +87,7 @@ impl<'d> Judge<'d> {
             is_mixed_up: false,
             is_soc_wrong: false,
             is_size_explained: false,
+            is_capacity_confirmed: false,
             is_model_wrong: false,
             wrong_layouts: Vec::new(),
         }

@@ -25,7 +25,9 @@ pub(super) fn check(judge: &mut Judge<'_>) {
         return;
     }
     let drift = Drift::of(judge);
-    let slope = cell_slope(judge).filter(|slope| slope.certainty() >= 1.0 && slope.r2 >= 0.2);
+    // A charger that lowers the current as the voltage rises looks like an inverted sign.
+    let is_possible = |slope: &Slope| slope.ohm > 0.0 || !judge.is_capacity_confirmed;
+    let slope = cell_slope(judge).filter(|slope| slope.certainty() >= 1.0 && slope.r2 >= 0.2 && is_possible(slope));
     if let Some(slope) = slope {
         if slope.ohm < 0.0 {
             let why = "a discharge lowers the voltage, but here the voltage rises with the configured discharge";
@@ -39,6 +41,8 @@ pub(super) fn check(judge: &mut Judge<'_>) {
         if !judge.is_size_explained && !judge.is_model_wrong {
             resistance(judge, &slope);
         }
+    } else if judge.is_capacity_confirmed {
+        judge.fine("the sign of the current is right: the reported SOC follows it".to_owned());
     } else if let Some(drift) = drift.filter(Drift::is_opposite) {
         let why = "a discharge lowers the voltage (judged from steady current, which is less certain than steps)";
         inverted(judge, signal, drifted_against(&drift), why);
@@ -86,7 +90,7 @@ fn drifted_against(drift: &Drift) -> String {
     )
 }
 
-fn inverted(judge: &mut Judge<'_>, signal: &SignalPlan, seen: String, why: &str) {
+pub(super) fn inverted(judge: &mut Judge<'_>, signal: &SignalPlan, seen: String, why: &str) {
     let is_csv = judge.plan.is_csv;
     let finding = error(judge, Topic::CurrentSign, "the sign of the current is inverted").seen(seen).why(why);
     if is_csv {
@@ -126,6 +130,8 @@ fn resistance(judge: &mut Judge<'_>, slope: &Slope) {
     // Only a wrong unit or the model of another cell explains such a ratio.
     if ratio >= 6.0 {
         current_unit(judge, seen, power_of_ten(ohm / (fast * slow).sqrt()), ratio);
+    } else if ohm < fast && pack.label.is_some() && judge.is_capacity_confirmed {
+        judge.fine(format!("the cells are made for high power, and the reported SOC confirms their capacity: {seen}"));
     } else if ratio >= ODD_RATIO || ratio >= 2.0 && strings.is_some_and(|n| n < configured) {
         // The resistance of a label's model is proportional to 1 / capacity.
         let (key, text) = pack.capacity_change(pack.capacity_ah * (fast * slow).sqrt() / ohm);
@@ -136,7 +142,7 @@ fn resistance(judge: &mut Judge<'_>, slope: &Slope) {
             finding.change("pack", "strings", strings.to_string());
         }
         finding
-            .change("pack", key, text)
+            .alternative("pack", key, text)
             .advice("the estimator itself learns a resistance of 0.3 to 3 times the model's");
     } else if slope.ohm > 0.0 {
         judge.fine(format!("the resistance is plausible: {seen}"));
@@ -191,7 +197,7 @@ pub(super) fn wrong_unit_or_cell<'j>(
         let title = format!("the cells are about {times} times {size} than in the cell model");
         let (key, text) = judge.plan.pack.capacity_change(judge.plan.pack.capacity_ah / factor);
         return find(judge, severity, Topic::CellModel, title).change("pack", key, text).advice(format!(
-            "or {} is off by that factor (scale = {scale}), or pack.strings is not {strings}",
+            "other possible causes: {} is off by that factor (scale = {scale}), or pack.strings is not {strings}",
             signal.name
         ));
     }
@@ -199,6 +205,6 @@ pub(super) fn wrong_unit_or_cell<'j>(
     find(judge, severity, Topic::Unit, format!("pack current: off by a factor of {times}{mark}"))
         .change(&signal.table, "scale", scale)
         .advice(format!(
-            "or the cells are {times} times {size} than in the cell model, or pack.strings is not {strings}"
+            "other possible causes: the cells are {times} times {size} than in the cell model, or pack.strings is not {strings}"
         ))
 }

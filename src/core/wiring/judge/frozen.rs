@@ -2,9 +2,13 @@
 //! voltage.
 
 use super::context::{EXPLAINED, Judge, SignalSeries, error, warning};
-use super::text::{channels, count, milli, number, ranges};
+use super::holes::span;
+use super::reported::reported;
+use super::text::{channels, count, milli, number, percent, ranges};
+use crate::filter::ends;
 use crate::quantity::Channel;
-use crate::wiring::evidence::{Series, Slope};
+use crate::wiring::evidence::usage::Moment;
+use crate::wiring::evidence::{HIDDEN_SOC, Series, Slope};
 use crate::wiring::plan::{Kind, SignalPlan};
 use crate::wiring::report::Topic;
 
@@ -36,7 +40,7 @@ fn voltages(judge: &mut Judge<'_>) {
         .seen(format!("{} is {value} in all {readings}", signal.name))
         .why(why)
         .change(&signal.table, "signal", "the measured signal, not a default or a copy")
-        .advice("or the sender repeats an old value");
+        .advice("another possible cause: the sender repeats an old value");
 }
 
 /// Finds a current that never changes, or hardly changes, although the voltages step as under a load.
@@ -69,6 +73,43 @@ fn pack_current(judge: &mut Judge<'_>, (signal, series): SignalSeries<'_>) {
         .seen(format!("{} {value} in all {readings}, while the voltages step by up to {step} mV", signal.name))
         .why("only a change of the current changes voltages this fast")
         .change(&signal.table, "signal", "the signal of the measured current");
+}
+
+/// Finds the longest stretch in which the current stays at one value near zero while the voltages step or the reported
+/// state of charge changes.
+pub(super) fn check_stopped(judge: &mut Judge<'_>) {
+    let (Some((signal, series)), Some(first)) = (judge.current(), judge.observed.first) else { return };
+    let noise_v = judge.median_of(Kind::Voltage, Series::noise).unwrap_or(0.0) / judge.cells_per_reading();
+    let least_v = (10.0 * noise_v * judge.voltage_factor).max(0.008);
+    let place = reported(judge, Channel::ReportedSoc).first().map(|(_, place)| *place);
+    let is_still = |a: &Moment, b: &Moment| a.stretch == b.stretch && a.current_a == b.current_a;
+    let runs = judge.observed.usage.moments().chunk_by(is_still);
+    let resting = runs.filter(|run| run[0].current_a.abs() <= judge.plan.pack.dead_band_a);
+    let moving = resting.filter_map(|run| Some((run, movement(run, place, least_v / judge.voltage_factor)?)));
+    let length_s = |run: &[Moment]| run[run.len() - 1].time.since(run[0].time);
+    let longest = moving.max_by(|a, b| length_s(a.0).total_cmp(&length_s(b.0)));
+    let Some((run, movement)) = longest.filter(|_| !series.is_constant() && !judge.is_mixed_up) else { return };
+    judge.is_mixed_up = true;
+    let (value, stretch) = (number(run[0].current_a), span(first, run[0].time, length_s(run)));
+    error(judge, Topic::Frozen, "pack current: it stops while the pack is in use")
+        .seen(format!("{} is {value} A in every reading {stretch}, while {movement}", signal.name))
+        .why("only a current changes the voltages this fast, or the state of charge this much")
+        .advice("the sensor or its sender fails in this time; estimates do not know the charge that flows");
+}
+
+/// How voltages or the reported state of charge (at `place`) show that a current flows, if they do. A resting voltage
+/// relaxes in one direction, and a controller corrects its state of charge by a jump, or by less than its largest error.
+fn movement(run: &[Moment], place: Option<usize>, least_v: f64) -> Option<String> {
+    let steps = |sign: f64| run.windows(2).filter(|p| sign * (p[1].voltage_v - p[0].voltage_v) > least_v).count();
+    let socs: Vec<f64> = place.map_or_else(Vec::new, |at| run.iter().map(|moment| moment.reported[at]).collect());
+    let (low, high) = ends(socs.iter().copied());
+    let largest = socs.windows(2).map(|pair| (pair[1] - pair[0]).abs()).fold(0.0, f64::max);
+    if high - low > HIDDEN_SOC && largest < 0.5 * (high - low) {
+        return Some(format!("the reported SOC moves between {} and {} %", percent(low), percent(high)));
+    }
+    // One wrong reading makes a step in each direction.
+    let (up, down) = (steps(1.0), steps(-1.0));
+    (up.min(down) >= 3).then(|| format!("the voltage of a cell makes {} steps above {} mV", up + down, milli(least_v)))
 }
 
 /// Finds cells whose signals show the voltage of another cell, from their bits and from their values.

@@ -3,23 +3,18 @@
 use super::context::{Judge, find};
 use super::text::{channel, count, number, percent, seconds};
 use crate::quantity::{Channel, Timestamp};
-use crate::wiring::evidence::Series;
+use crate::wiring::evidence::HIDDEN_SOC;
 use crate::wiring::evidence::usage::Moment;
 use crate::wiring::observer::Hole;
-use crate::wiring::plan::Kind;
+use crate::wiring::plan::{Kind, SignalPlan};
 use crate::wiring::report::{Severity, Topic};
 
-/// Shortest missing stretch of an input that is reported (s), and its shortest length in periods of the input.
-const LEAST_S: f64 = 60.0;
-const LEAST_PERIODS: f64 = 20.0;
 /// A log with more holes than this consists of many trips: its holes are pauses.
 const FEW: usize = 3;
 
 pub(super) fn check(judge: &mut Judge<'_>) {
     of_log(judge);
-    for kind in [Kind::Current, Kind::Voltage, Kind::Temperature, Kind::Reported] {
-        of_input(judge, kind);
-    }
+    of_inputs(judge);
 }
 
 /// Reports the holes of the log. Only a hole in which the pack was in use is a warning: a parked car's buses sleep.
@@ -43,31 +38,36 @@ fn of_log(judge: &mut Judge<'_>) {
 
 /// The longest hole in which the pack was in use, and how the readings around the hole show this.
 fn used_hole<'d>(judge: &Judge<'d>) -> Option<(&'d Hole, String)> {
-    let moments = judge.observed.usage.moments();
-    let use_of = |hole: &'d Hole| {
-        let before = moments.iter().rfind(|moment| moment.time <= hole.from)?;
-        let after = &moments[moments.partition_point(|moment| moment.time < hole.to)..];
-        Some((hole, use_between(judge, before, after)?))
-    };
+    let use_of = |hole: &'d Hole| Some((hole, use_in(judge, hole)?));
     let used = judge.observed.holes.iter().filter_map(use_of);
     used.max_by(|a, b| a.0.seconds().total_cmp(&b.0.seconds()))
 }
 
+/// How the readings around a hole show that the pack was in use.
+fn use_in(judge: &Judge<'_>, hole: &Hole) -> Option<String> {
+    let moments = judge.observed.usage.moments();
+    let before = moments.iter().rfind(|moment| moment.time <= hole.from)?;
+    use_between(judge, before, &moments[moments.partition_point(|moment| moment.time < hole.to)..])
+}
+
+/// How the readings around a missing stretch show that the pack was in use. A parked pack feeds small loads, and its
+/// controller corrects the state of charge by some per cent.
 fn use_between(judge: &Judge<'_>, before: &Moment, after: &[Moment]) -> Option<String> {
-    /// A reported state of charge that changes by more than this shows that charge flowed.
-    const LEAST_CHANGE: f64 = 0.02;
+    /// Smallest mean current that shows use, in multiples of the capacity per hour.
+    const LEAST_RATE: f64 = 0.1;
+    let hours = after.first()?.time.since(before.time) / 3600.0;
     let socs = judge.observed.witnesses.iter().enumerate();
     let mut socs = socs.filter(|(_, w)| judge.plan.witness(**w).binding.channel == Channel::ReportedSoc);
     let change = socs.find_map(|(place, _)| {
         // The first reported value may arrive some time after the hole.
         let to = after.iter().map(|moment| moment.reported[place]).find(|value| value.is_finite())?;
         let from = before.reported[place];
-        ((to - from).abs() > LEAST_CHANGE).then_some((from, to))
+        ((to - from).abs() > HIDDEN_SOC.min((LEAST_RATE * hours).max(0.02))).then_some((from, to))
     });
-    let (dead_a, after_a) = (judge.plan.pack.dead_band_a, after.first()?.current_a);
+    let (least_a, after_a) = (LEAST_RATE * judge.pack_ah(), after.first()?.current_a);
     if let Some((from, to)) = change {
         Some(format!("the reported SOC is {} % before and {} % after it", percent(from), percent(to)))
-    } else if before.current_a.abs() > dead_a && after_a.abs() > dead_a {
+    } else if before.current_a.abs() > least_a && after_a.abs() > least_a {
         let [from, to] = [before.current_a, after_a].map(number);
         Some(format!("the current is {from} A before and {to} A after it"))
     } else {
@@ -75,29 +75,65 @@ fn use_between(judge: &Judge<'_>, before: &Moment, after: &[Moment]) -> Option<S
     }
 }
 
-/// Reports the longest stretch in which an input of a kind is missing while other frames arrive.
-fn of_input(judge: &mut Judge<'_>, kind: Kind) {
-    let least_s = |series: &Series| LEAST_S.max(LEAST_PERIODS * series.period_s().unwrap_or(f64::INFINITY));
+/// Reports for each kind of input the longest stretch in which it is missing while other frames arrive. Kinds that are
+/// missing at the same time are one finding: their sender slept.
+fn of_inputs(judge: &mut Judge<'_>) {
+    let mut found: Vec<MissingInput<'_>> = Vec::new();
+    for kind in [Kind::Current, Kind::Voltage, Kind::Temperature, Kind::Reported] {
+        let Some(next) = missing_input(judge, kind) else { continue };
+        let is_same = |other: &&mut MissingInput<'_>| {
+            let overlap_s = next.hole.to.min(other.hole.to).since(next.hole.from.max(other.hole.from));
+            overlap_s > 0.8 * next.hole.seconds().max(other.hole.seconds())
+        };
+        match found.iter_mut().find(is_same) {
+            Some(other) => other.names.extend(next.names),
+            None => found.push(next),
+        }
+    }
+    found.into_iter().for_each(|missing| report(judge, missing));
+}
+
+/// A stretch in which inputs are missing. The signal and its period are those of the first input.
+struct MissingInput<'d> {
+    names: Vec<String>,
+    signal: &'d SignalPlan,
+    period_s: f64,
+    hole: Hole,
+}
+
+fn missing_input<'d>(judge: &Judge<'d>, kind: Kind) -> Option<MissingInput<'d>> {
     let all = judge.signals(kind);
-    let missing = all.iter().filter(|(_, series)| series.longest_gap_s > least_s(series));
-    let longest = missing.clone().max_by(|a, b| a.1.longest_gap_s.total_cmp(&b.1.longest_gap_s));
-    let (Some((signal, series)), Some(first)) = (longest, judge.observed.first) else { return };
-    let Some(from) = series.longest_gap_from else { return };
-    let name = match (kind, missing.count()) {
+    let missing: Vec<_> =
+        all.iter().filter_map(|(signal, series)| Some((signal, series, series.longest_missing?))).collect();
+    let (signal, series, (from, length_s)) = missing.iter().max_by(|a, b| a.2.1.total_cmp(&b.2.1))?;
+    let name = match (kind, missing.len()) {
         (Kind::Voltage, n) if n > 1 => format!("{n} voltages"),
         (Kind::Temperature, n) if n > 1 => format!("{n} temperatures"),
         _ => channel(signal.binding.channel),
     };
-    let severity = if kind == Kind::Reported { Severity::Note } else { Severity::Warning };
-    let (gap, period) = (seconds(series.longest_gap_s), seconds(series.period_s().unwrap_or(0.0)));
-    let span = span(first, from, series.longest_gap_s);
-    find(judge, severity, Topic::Missing, format!("{name}: no reading for {gap} while other frames arrive"))
+    let hole = Hole { from: *from, to: from.plus_secs(*length_s) };
+    Some(MissingInput { names: vec![name], signal, period_s: series.period_s().unwrap_or(0.0), hole })
+}
+
+fn report(judge: &mut Judge<'_>, MissingInput { names, signal, period_s, hole }: MissingInput<'_>) {
+    let Some(first) = judge.observed.first else { return };
+    // If current and voltages are missing together, the pack sleeps.
+    let is_asleep = names.len() > 1 && use_in(judge, &hole).is_none();
+    let is_minor = is_asleep || Kind::of(signal.binding.channel) == Kind::Reported;
+    let severity = if is_minor { Severity::Note } else { Severity::Warning };
+    let why = match is_asleep {
+        true => "the pack's controller slept while other nodes were awake",
+        false => "the sender, a gateway or the logger left it out; estimates do not know this time",
+    };
+    let (gap, period, names) = (seconds(hole.seconds()), seconds(period_s), names.join(", "));
+    let span = span(first, hole.from, hole.seconds());
+    find(judge, severity, Topic::Missing, format!("{names}: no reading for {gap} while other frames arrive"))
         .seen(format!("{} arrives every {period}, but not {span}", signal.name))
-        .why("the sender, a gateway or the logger left it out; estimates do not know this time");
+        .why(why);
 }
 
 /// Describes a stretch by its times after the first frame.
-fn span(first: Timestamp, from: Timestamp, length_s: f64) -> String {
+pub(super) fn span(first: Timestamp, from: Timestamp, length_s: f64) -> String {
     let start_s = from.since(first);
     format!("from {} to {} after the first frame", seconds(start_s), seconds(start_s + length_s))
 }

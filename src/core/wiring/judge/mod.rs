@@ -54,6 +54,7 @@ impl WiringObserver {
         swapped::check_odd(&mut judge);
         frozen::check_equal(&mut judge);
         values::check_limits(&mut judge);
+        frozen::check_stopped(&mut judge);
         reported::check_swapped(&mut judge);
         reported::check_charge(&mut judge);
         reported::check_voltage(&mut judge);

@@ -3,10 +3,12 @@
 
 use super::context::{Judge, error, note, warning};
 use super::drift::Drift;
-use super::ocv;
+use super::ocv::{self, OcvEstimate};
+use super::reported::reported;
 use super::text::{milli, number, percent, seconds, toml};
 use crate::cell::{CellModel, Chemistry};
 use crate::filter::{ends, median};
+use crate::quantity::Channel;
 use crate::wiring::evidence::Series;
 use crate::wiring::plan::Kind;
 use crate::wiring::report::Topic;
@@ -39,8 +41,9 @@ fn open_circuit(judge: &mut Judge<'_>, model: &CellModel, drift: Option<Drift>) 
     };
     let pack = &judge.plan.pack;
     let cell_v = judge.cell_voltage();
-    if highest > full_v + 0.06 || lowest < empty_v - 0.06 {
-        let off_v = if highest > full_v + 0.06 { highest } else { lowest };
+    let limit_v = if is_held_full(judge, &loaded, full_v) { full_v.max(model.voltage_max_v) } else { full_v } + 0.06;
+    if highest > limit_v || lowest < empty_v - 0.06 {
+        let off_v = if highest > limit_v { highest } else { lowest };
         let (off, low, high) = (number(off_v), number(empty_v), number(full_v));
         let (key, text) = chemistry(judge, off_v);
         error(judge, Topic::CellModel, "the resting voltage is not on the cell model's curve")
@@ -73,6 +76,18 @@ fn open_circuit(judge: &mut Judge<'_>, model: &CellModel, drift: Option<Drift>) 
     } else {
         judge.unjudged("open-circuit voltage: the pack did not rest; leave it without load for a minute");
     }
+}
+
+/// Whether the voltage is above the curve only while the charger holds it there: the pack is not discharged at these
+/// voltages, and reports that it is full or, without such a report, was charged from the curve.
+fn is_held_full(judge: &Judge<'_>, estimates: &[OcvEstimate], full_v: f64) -> bool {
+    let is_above = |estimate: &&OcvEstimate| estimate.voltage_v - estimate.slack_v > full_v;
+    let above: Vec<&OcvEstimate> = estimates.iter().filter(is_above).collect();
+    let discharged = above.iter().filter(|estimate| estimate.current_a > judge.plan.pack.dead_band_a).count();
+    let is_charged = estimates.first().is_some_and(|first| !is_above(&first));
+    let place = reported(judge, Channel::ReportedSoc).first().map(|(_, place)| *place);
+    let soc = place.and_then(|place| median(above.iter().map(|e| e.reported[place]).filter(|soc| soc.is_finite())));
+    10 * discharged <= above.len() && soc.map_or(is_charged, |soc| soc >= 0.9)
 }
 
 /// Largest rise of the voltage from 30 to 80 % of a flat curve (V): LFP has 0.06 V, other chemistries 0.3 V or more.

@@ -18,6 +18,8 @@ pub(super) struct OcvEstimate {
     pub(super) voltage_v: f64,
     /// Largest error of the estimate (V).
     pub(super) slack_v: f64,
+    /// Current (A), positive = discharge.
+    pub(super) current_a: f64,
     /// Values that the pack reports at this time.
     pub(super) reported: [f64; MAX_REPORTED],
     pub(super) stretch: u32,
@@ -38,6 +40,7 @@ pub(super) fn estimates(judge: &Judge<'_>) -> Vec<OcvEstimate> {
         OcvEstimate {
             voltage_v: moment.voltage_v * judge.voltage_factor + fast_ohm * now_a + slow_ohm * slow_a,
             slack_v: SLACK_V + 0.5 * (fast_ohm * now_a.abs() + slow_ohm * slow_a.abs()),
+            current_a: now_a,
             reported: moment.reported,
             stretch: moment.stretch,
         }

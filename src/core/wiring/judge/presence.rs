@@ -19,6 +19,8 @@ enum Absence {
     NotAvailable,
     NotFinite,
     Short,
+    /// The direction of a current that is sent as a magnitude is missing.
+    Direction,
     /// The value is constant and far below a cell voltage (voltages only).
     Zero,
 }
@@ -42,7 +44,11 @@ pub(super) fn check(judge: &mut Judge<'_>) {
 
 fn absence(judge: &Judge<'_>, signal: &SignalPlan, series: &Series) -> Option<Absence> {
     if series.count() == 0 {
+        let is_magnitude = signal.binding.channel == Channel::Current && judge.plan.has_direction();
+        let is_on_bus = judge.bus(signal.binding.bus).is_some_and(|bus| bus.ids.contains_key(&signal.binding.id));
         return Some(match series.unusable {
+            // Without its direction, a magnitude is not read.
+            _ if series.frames == 0 && is_magnitude && is_on_bus => Absence::Direction,
             _ if series.frames == 0 => Absence::Message,
             unusable if unusable.not_available > 0 => Absence::NotAvailable,
             unusable if unusable.not_finite > 0 => Absence::NotFinite,
@@ -97,6 +103,7 @@ fn reason_for_cells(absence: Absence) -> &'static str {
         Absence::NotAvailable => "always \"signal not available\"",
         Absence::NotFinite => "never a valid number",
         Absence::Short => "their frames are too short",
+        Absence::Direction => "their direction is missing",
         Absence::Zero => "always the same value near zero",
     }
 }
@@ -142,6 +149,7 @@ fn evidence(judge: &Judge<'_>, absence: Absence, signals: &[&SignalPlan], what: 
             let needed = signals.iter().map(|s| s.binding.plan.bytes_needed()).max().unwrap_or(0);
             format!("has {longest} bytes, {needed} are needed")
         }
+        Absence::Direction => "was received, but never with the direction of the current".to_owned(),
         Absence::Zero => "was received, but this signal is always zero".to_owned(),
     }
 }
@@ -163,6 +171,10 @@ fn cause(judge: &Judge<'_>, bus: BusIndex, id: CanId, absence: Absence) -> (&'st
         Absence::NotFinite => {
             ("the bits are not a valid float", "compare the DBC's value type with the sender's documentation")
         }
+        Absence::Direction => (
+            "the current is configured with `sign`, and its direction signal has no value",
+            "configure the signal that carries the direction, or remove `sign` if the current is signed",
+        ),
         Absence::Short => ("the frame ends before the signal", "the DBC belongs to another version of this sender"),
         Absence::Zero if judge.cell_voltage() != Some(0.0) => {
             ("there is no cell at this position", "compare with the pack's own list of cells")

@@ -2,7 +2,7 @@
 //! voltages. The pack's own values are witnesses: a wrong number of cells, a wrong chemistry, a wrong capacity or a
 //! wrong current contradicts them.
 
-use super::context::{Judge, error};
+use super::context::{EXPLAINED, Judge, error, find};
 use super::electrical;
 use super::ocv::{self, OcvEstimate};
 use super::text::{number, percent, toml};
@@ -11,14 +11,17 @@ use crate::filter::{ends, median};
 use crate::quantity::Channel;
 use crate::wiring::evidence::HIDDEN_SOC;
 use crate::wiring::evidence::usage::{ChargeSlope, Moment};
-use crate::wiring::plan::SignalPlan;
-use crate::wiring::report::Topic;
+use crate::wiring::plan::{SignalPlan, two_digits};
+use crate::wiring::report::{Severity, Topic};
 
 /// Smallest change of a reported state of charge that is compared with the counted charge.
 const LEAST_RANGE: f64 = 0.05;
 /// A reported value contradicts the voltage if more than this share of the moments disagree. It agrees if at most the
 /// rest disagree.
 const MOST: f64 = 0.75;
+
+/// Usual ratios of the counted to the configured capacity.
+const USUAL: std::ops::RangeInclusive<f64> = 0.55..=1.3;
 
 /// A reported state of charge: its signal, and its place in the record of the pack's use.
 type Reported<'d> = (&'d SignalPlan, usize);
@@ -33,7 +36,10 @@ pub(super) fn check_charge(judge: &mut Judge<'_>) {
         let slope = ChargeSlope::of(judge.observed.usage.moments(), place)?;
         (slope.range >= LEAST_RANGE && slope.distinct >= 5).then_some((signal, slope))
     });
-    if let Some((signal, slope)) = found.filter(|_| series.is_constant()) {
+    let pack_ah = judge.pack_ah();
+    let is_explained =
+        |slope: &ChargeSlope| slope.r2 >= EXPLAINED && USUAL.contains(&(slope.capacity_ah / pack_ah).abs());
+    if let Some((signal, slope)) = found.filter(|(_, slope)| series.is_constant() && !is_explained(slope)) {
         return constant(judge, current, signal, slope);
     }
     let dead_a = judge.plan.pack.dead_band_a;
@@ -53,7 +59,13 @@ pub(super) fn check_charge(judge: &mut Judge<'_>) {
         }
     }
     let Some((signal, slope)) = found else { return too_much(judge, current) };
-    let ratio = slope.capacity_ah / judge.pack_ah();
+    let ratio = slope.capacity_ah / pack_ah;
+    judge.is_capacity_confirmed = is_explained(&slope) && ratio > 0.0;
+    if is_explained(&slope) && ratio < 0.0 && !electrical::is_inverted(judge) {
+        judge.is_mixed_up = true;
+        let seen = format!("{} rises with the configured discharge that {} counts", signal.name, current.name);
+        return electrical::inverted(judge, current, seen, "a discharge lowers the state of charge");
+    }
     let [counted, range] = [slope.charge_range_ah, 100.0 * slope.range].map(number);
     if slope.r2 < 0.3 {
         judge.is_mixed_up = true;
@@ -64,7 +76,7 @@ pub(super) fn check_charge(judge: &mut Judge<'_>) {
             ))
             .why("the charge that flows changes the state of charge: this signal is not the pack's current")
             .change(&current.table, "signal", "the signal of the measured current");
-    } else if slope.r2 >= 0.8 && ratio > 0.0 && !(0.55..=1.3).contains(&ratio) {
+    } else if slope.r2 >= EXPLAINED && ratio > 0.0 && !USUAL.contains(&ratio) {
         size(judge, (signal, current), slope, ratio);
     }
 }
@@ -123,7 +135,7 @@ fn size(judge: &mut Judge<'_>, (signal, current): (&SignalPlan, &SignalPlan), sl
     judge.is_size_explained = true;
     let (cell_ah, scale) = (slope.capacity_ah / strings, current.scale / ratio);
     // The capacity of a used pack differs from the label, so a scale near 1 is probably 1.
-    let scale = if (0.8..=1.25).contains(&scale) { 1.0 } else { round(scale) };
+    let scale = if (0.8..=1.25).contains(&scale) { 1.0 } else { two_digits(scale) };
     let seen = format!(
         "{} falls from 100 to 0 % over {measured} Ah counted from {}; {configured} Ah are configured",
         signal.name, current.name
@@ -131,28 +143,27 @@ fn size(judge: &mut Judge<'_>, (signal, current): (&SignalPlan, &SignalPlan), sl
     let why = "a worn pack has at least half of its capacity, and a new one hardly more than the label says";
     if current.scale == 1.0 {
         let (key, text) = judge.plan.pack.capacity_change(cell_ah);
-        error(judge, Topic::CellModel, format!("the capacity is about {measured} Ah, {configured} Ah are configured"))
-            .seen(seen)
-            .why(why)
-            .change("pack", key, text)
-            .advice(format!("or {} is off by that factor (scale = {})", current.name, toml(scale)));
+        // A dashboard may show 25 to 90 % of the capacity as 0 to 100 %.
+        let may_be_dashboard = ratio < 1.0 && USUAL.contains(&(ratio / 0.65));
+        let severity = if may_be_dashboard { Severity::Note } else { Severity::Error };
+        let title = format!("the capacity is about {measured} Ah, {configured} Ah are configured");
+        find(judge, severity, Topic::CellModel, title).seen(seen).why(why).change("pack", key, text).advice(format!(
+            "another possible cause: {} is off by that factor (scale = {})",
+            current.name,
+            toml(scale)
+        ));
     } else {
         let times = number(ratio.max(1.0 / ratio));
         error(judge, Topic::Unit, format!("pack current: off by a factor of {times}"))
             .seen(seen)
             .why(why)
             .change(&current.table, "scale", toml(scale))
-            .advice(format!("or the capacity is {measured} Ah"));
+            .advice(format!("another possible cause: the capacity is {measured} Ah"));
     }
 }
 
-/// Rounds to two significant digits, because the capacity of a used pack is not exact.
-fn round(value: f64) -> f64 {
-    format!("{value:.1e}").parse().unwrap_or(value)
-}
-
 /// The signals that report `channel` and have values, the configured ones first.
-fn reported<'d>(judge: &Judge<'d>, channel: Channel) -> Vec<Reported<'d>> {
+pub(super) fn reported<'d>(judge: &Judge<'d>, channel: Channel) -> Vec<Reported<'d>> {
     let witnesses = judge.observed.witnesses.iter().enumerate();
     let of_channel = witnesses.map(|(place, witness)| (judge.plan.witness(*witness), place));
     // A value that is always zero is not sent by this pack.
@@ -272,17 +283,22 @@ fn contradiction(judge: &mut Judge<'_>, seen: String, counts: Option<(u16, u16)>
         finding.change("pack", "cells", text);
     }
     if let Some((key, text)) = model {
-        finding.change("pack", key, text);
+        finding.alternative("pack", key, text);
     }
 }
 
 /// Share of the moments whose voltage per cell, multiplied by `factor`, does not fit the reported state of charge.
 fn outside(judge: &Judge<'_>, points: &[(OcvEstimate, f64)], model: &CellModel, factor: f64) -> f64 {
-    let temperature_c = judge.temperature_c();
+    let (temperature_c, dead_a) = (judge.temperature_c(), judge.plan.pack.dead_band_a);
     let ocv_v = |soc: f64| model.ocv_v(&model.grid_position(soc.clamp(0.0, 1.0), temperature_c));
     let is_outside = |(estimate, soc): &&(OcvEstimate, f64)| {
-        let (low, high) = (ocv_v(soc - HIDDEN_SOC) - estimate.slack_v, ocv_v(soc + HIDDEN_SOC) + estimate.slack_v);
-        !(low..=high).contains(&(estimate.voltage_v * factor))
+        // A dashboard hides a reserve, most of it below 0 %.
+        let reserve = (0.25 * (1.0 - soc)).max(HIDDEN_SOC);
+        let may_be_full = soc + reserve >= 1.0 && estimate.current_a <= dead_a;
+        let (low_v, high_v) = (ocv_v(soc - HIDDEN_SOC), ocv_v(soc + reserve));
+        // While a pack is full, the charger holds the voltage above the curve.
+        let high_v = if may_be_full { high_v.max(model.voltage_max_v) } else { high_v };
+        !(low_v - estimate.slack_v..=high_v + estimate.slack_v).contains(&(estimate.voltage_v * factor))
     };
     points.iter().filter(is_outside).count() as f64 / points.len().max(1) as f64
 }

@@ -91,6 +91,10 @@ fn cycle_times(judge: &mut Judge<'_>) {
         let Some(cycle_s) = message.cycle_time_s.filter(|_| message.pages <= 1) else { continue };
         let (span_s, awake_s) = (stats.last.since(stats.first), judge.observed.awake_s);
         let span_s = if awake_s + 1.0 < span_s { awake_s } else { span_s };
+        // The sender may sleep while the bus is awake.
+        let signals = judge.plan.signals.iter().zip(&judge.observed.series);
+        let of_message = signals.filter(|(s, _)| (s.binding.bus, s.binding.id) == (message.bus, message.id));
+        let span_s = span_s - of_message.map(|(_, series)| series.missing_s).fold(0.0, f64::max);
         let period_s = span_s / (stats.count.max(2) - 1) as f64;
         if stats.count < 10 || period_s < 2.0 * cycle_s {
             continue;

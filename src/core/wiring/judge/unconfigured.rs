@@ -61,7 +61,7 @@ fn pack_voltage(judge: &mut Judge<'_>, is_clear: bool) {
     let finding = warning(judge, Topic::PackVoltage, "the cells do not add up to the pack's voltage")
         .seen(format!("the medians of {cells} cells add up to {sum} V; {} is {pack} V", signal.name))
         .why("the voltages of cells in series add up")
-        .advice("or a cell's signal, its factor, or the factor of the pack's voltage in the DBC is wrong");
+        .advice("other possible causes: a cell's signal, its factor, or the factor of the pack's voltage in the DBC is wrong");
     if counted >= 1.0 && counted != f64::from(cells) {
         finding.change("pack", "cells", format!("{counted} cells would have that voltage"));
     }

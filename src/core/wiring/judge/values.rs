@@ -115,7 +115,7 @@ fn voltages(judge: &mut Judge<'_>) {
             .seen(seen)
             .why(format!("{band}, and no power of ten corrects the reading"))
             .change("pack", key, text)
-            .advice("or the signal is not a cell voltage");
+            .advice("another possible cause: the signal is not a cell voltage");
     }
 }
 
@@ -173,7 +173,7 @@ fn pack_count(judge: &mut Judge<'_>, total_v: f64) {
         .why(format!("cells of this model have {min_v} to {max_v} V: {fewest} to {most} cells are possible"))
         .change("pack", "cells", format!("{fewest} to {most}, the number in the pack's documentation"));
     if let Some(names) = other {
-        finding.advice(format!("or pack.chemistry is wrong: {per_cell} V per cell fits {names}"));
+        finding.advice(format!("another possible cause: pack.chemistry is wrong; {per_cell} V per cell fits {names}"));
     }
 }
 

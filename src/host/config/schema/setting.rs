@@ -129,9 +129,10 @@ impl Setting for NumberRange {
     }
 }
 
-/// Makes an enum the type of a key, and declares the allowed words with the value that each word stands for.
+/// Makes an enum the type of a key, and declares the allowed words with the value that each word stands for. A second
+/// word is a short form.
 macro_rules! choice {
-    ($type:ty { $($word:literal => $value:expr),+ $(,)? }) => {
+    ($type:ty { $($word:literal $(| $short:literal)? => $value:expr),+ $(,)? }) => {
         impl $crate::config::schema::Setting for $type {
             const KIND: &'static str = "one of";
             const CHOICES: &'static [&'static str] = &[$($word),+];
@@ -141,7 +142,7 @@ macro_rules! choice {
                 _: &$crate::config::schema::ValueRange,
             ) -> Result<Self, $crate::config::schema::ValueFault> {
                 let choice = match $crate::config::schema::typed(value, value.get_ref().as_str())? {
-                    $($word => Some($value),)+
+                    $($word $(| $short)? => Some($value),)+
                     _ => None,
                 };
                 $crate::config::schema::in_range(value, choice)

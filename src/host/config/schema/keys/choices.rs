@@ -69,12 +69,12 @@ choice!(E2eKey {
 choice!(secoc::Profile { "1" => Self::P1, "3" => Self::P3, "fd" => Self::Fd });
 choice!(Discretisation { "exact" => Self::Exact, "euler" => Self::Euler });
 choice!(Chemistry {
-    "nmc811-graphite" => Self::Nmc811Graphite,
-    "nmc-graphite" => Self::NmcGraphite,
-    "nca-graphite" => Self::NcaGraphite,
-    "lco-graphite" => Self::LcoGraphite,
-    "lmo-graphite" => Self::LmoGraphite,
-    "lfp-graphite" => Self::LfpGraphite,
+    "nmc811-graphite" | "nmc811" => Self::Nmc811Graphite,
+    "nmc-graphite" | "nmc" => Self::NmcGraphite,
+    "nca-graphite" | "nca" => Self::NcaGraphite,
+    "lco-graphite" | "lco" => Self::LcoGraphite,
+    "lmo-graphite" | "lmo" => Self::LmoGraphite,
+    "lfp-graphite" | "lfp" => Self::LfpGraphite,
 });
 choice!(CapacityState { "joint" => Self::Joint, "held" => Self::Held });
 choice!(RechargeAlarm { "raw" => Self::Raw, "normalised" => Self::Normalised });

@@ -32,7 +32,7 @@ section! {
         strings: u16, "", Between(1.0, 1024.0), Default("1");
         /// Cell model file, relative to this file.
         cell_model: Option<String>, "", NotEmpty, Optional("a model made from `chemistry` and `rated_capacity_ah`");
-        /// Chemistry of a cell without a model file. Estimates start from values typical of this chemistry, and their intervals cover the differences between such cells. "lmo-graphite" means the blend with a layered oxide used in early electric cars. Use "nmc-graphite" if the nickel content is unknown.
+        /// Chemistry of a cell without a model file. Estimates start from values typical of this chemistry, and their intervals cover the differences between such cells. "lmo-graphite" means the blend with a layered oxide used in early electric cars. Use "nmc-graphite" if the nickel content is unknown. `-graphite` may be left out.
         chemistry: Option<Chemistry>, "", Any, Optional("required without `cell_model`");
         /// Whether the daemon learns the model of cells without a model file on board, from drives, charges and rests.
         learn_model: bool, "", Any, Default("true");
