@@ -436,14 +436,14 @@ fn malformed_journal_lines_are_counted() {
 #[test]
 fn csv_rows_become_frames_bad_fields_are_named() {
     let folder = tempfile::tempdir().expect("a folder");
-    let text = b"time_s,current_a,voltage_v,temperature_c\n0,1.5,4.0,25\n1.25,,3.9,25\n2,NaN,3.9,25\n3,1,oops,25\n4,1\n5,2,3.8,\n";
+    let text = b"time_s,current_a,voltage_v,temperature_c\n0,1.5,4.0,25\n1.25,,3.9,25\n2,NaN,3.9,25\n3,1,oops,25\n4,1\n5,2,3.8,\n6,1";
     let path = file(folder.path(), "a.csv", text);
     let (records, counts) = read(std::slice::from_ref(&path), false, |_| {}).expect("read");
-    assert_eq!(millis(&records), [0, 1250, 5000]);
-    assert_eq!((counts.lines, counts.frames, counts.bad_lines), (6, 3, 3));
+    assert_eq!(millis(&records), [0, 1250, 2000, 4000, 5000]);
+    assert_eq!((counts.lines, counts.frames, counts.bad_lines), (7, 5, 2));
     let first = counts.first_bad_line.expect("shown");
     assert!(
-        first.ends_with("a.csv:4: column current_a: found \"NaN\", must be a finite number or an empty field"),
+        first.ends_with("a.csv:5: column voltage_v: found \"oops\", must be a finite number or an empty field"),
         "{first}"
     );
     let data = |record: &Record| match &record.kind {
@@ -451,6 +451,7 @@ fn csv_rows_become_frames_bad_fields_are_named() {
         other => panic!("{other:?}"),
     };
     assert_eq!((data(&records[0]), data(&records[1])), (vec![15, 40], vec![0xFF, 39]));
+    assert_eq!((data(&records[2]), data(&records[3])), (vec![0xFF, 39], vec![10, 0xFF]));
     let (flipped, _) = read(&[path], false, |o| o.csv.charge_positive = Some(true)).expect("read");
     assert_eq!(data(&flipped[0])[0] as i8, -15);
 }

@@ -161,9 +161,9 @@ fn values_in_wrong_unit_are_refused_by_name() {
         ("no cell", scaled(&rows, own, [1.0, 1.0, 0.05]), &[], "half of the readings are below"),
         (
             "unknown header",
-            scaled(&rows, "time_s,strom,voltage_v", [1.0; 3]),
+            scaled(&rows, "time_s,stroom,voltage_v", [1.0; 3]),
             &[],
-            "no column for current, found time_s,strom,voltage_v; name it with --column current=NAME",
+            "no column for current, found time_s,stroom,voltage_v; name it with --column current=NAME",
         ),
     ] {
         let path = bench.file("x.csv", &bytes);

@@ -220,7 +220,9 @@ impl CsvLog {
         }
         self.last_time = Some(time);
         for &(channel, column) in &self.channels {
-            let Some(value) = row.parsed(column.index) else {
+            // The last line of a file may be torn, so its last number may be, too.
+            let is_torn = after.is_none() && row.bytes(column.index).is_none();
+            let Some(value) = row.parsed(column.index).filter(|_| !is_torn) else {
                 return Ok(Some(Err(row.fault(column.index, NUMBER))));
             };
             let value = value.map(|value| column.unit.convert(value));
