@@ -81,7 +81,7 @@ mod tests {
     fn rows_without_capacity_are_skipped() {
         let rows = of("cycle,start,capacity_ah_source\n0,2008-04-02T13:08:17,\n1,2008-04-02T15:25:41,1.856\n").unwrap();
         assert_eq!((rows.capacities, rows.is_loaded), (vec![(1_207_149_941.0, 1.856)], true));
-        assert_eq!(of("time_s,capacity_ah\n20,2\n10,1\n").unwrap().capacities[0].1, 1.0);
+        assert_eq!(of("time_s,capacity_ah\n20,2\n10,1\n30,NaN\n").unwrap().capacities, [(10.0, 1.0), (20.0, 2.0)]);
     }
 
     #[test]
@@ -97,7 +97,7 @@ mod tests {
     fn fault_names_its_line() {
         assert!(of("a,b\n1,2\n").unwrap_err().contains("r.csv:1: no column capacity_ah or capacity_ah_source or soc"));
         assert!(
-            of("time_s,capacity_ah\n1,2\n2,NaN\n").unwrap_err().contains("r.csv:3: column capacity_ah: found \"NaN\"")
+            of("time_s,capacity_ah\n1,2\n2,new\n").unwrap_err().contains("r.csv:3: column capacity_ah: found \"new\"")
         );
         assert!(of("time_s,capacity_ah\nsoon,2\n").unwrap_err().contains("r.csv:2: column time_s: found \"soon\""));
         assert!(

@@ -167,7 +167,7 @@ mod tests {
         for (rows, fault) in [
             ("0,2.1\n1,x\n", "cell.csv:3: column capacity_ah: found \"x\", must be Ah above 0 or nothing"),
             ("0,-1\n", "cell.csv:2: column capacity_ah: found \"-1\", must be Ah above 0 or nothing"),
-            ("0,nan\n", "cell.csv:2: column capacity_ah: found \"nan\", must be Ah above 0 or nothing"),
+            ("0,nan\n", "cell.csv: no row with a capacity, needs at least one"),
             ("soon,1\n", "cell.csv:2: column date: found \"soon\", must be like 2008-04-02T13:08:17.921 or seconds"),
             ("5,2\n4,2\n", "cell.csv:3: column date: found \"4\", must be no earlier than the row before"),
             ("0,\n", "cell.csv: no row with a capacity, needs at least one"),
