@@ -303,7 +303,11 @@ impl Writer<'_> {
     fn input(&self, table: &str, candidate: &Candidate, signal: &str, more: &str, text: &mut String) {
         let _ = write!(text, "\n# {}\n{table}\nsignal = {}\n", plain(&candidate.reasons.join("; ")), quoted(signal));
         let _ = write!(text, "interface = {}\n{more}", quoted(&candidate.interface));
-        let (scale, offset) = self.signal(candidate.members[0]).conversion;
+        let (mut scale, offset) = self.signal(candidate.members[0]).conversion;
+        // A configured scale replaces that of a percentage.
+        if scale != 1.0 && matches!(candidate.quantity, PackQuantity::Soc | PackQuantity::Soh) {
+            scale *= 0.01;
+        }
         for (key, value) in [("scale", scale), ("offset", offset)] {
             if value != if key == "scale" { 1.0 } else { 0.0 } {
                 let _ = writeln!(text, "{key} = {value}");

@@ -8,6 +8,11 @@
 use super::series::Series;
 use crate::filter::median;
 
+/// Shortest time of a longer step (s): within a second, the load of a car changes.
+const LEAST_STEP_S: f64 = 1.0;
+/// Share of the changes that the steps between readings must explain; otherwise, longer steps are used.
+const LEAST_R2: f64 = 0.25;
+
 /// A slope through the origin.
 #[derive(Debug, Clone, Copy)]
 pub struct Slope {
@@ -53,7 +58,23 @@ impl Slope {
     /// Slope of a recorded voltage against a recorded current, or of any two signals; `None` if there are too few
     /// steps.
     pub fn between(voltage: &Series, current: &Series) -> Option<Self> {
-        let pairs = pairs(voltage, current);
+        let mut pairs = pairs(voltage, current);
+        let of_each = Self::of_steps(&pairs);
+        if of_each.is_some_and(|slope| slope.r2 >= LEAST_R2) {
+            return of_each;
+        }
+        // From one fast reading to the next, a current may change the voltage by less than its resolution.
+        let mut latest_s = f64::NEG_INFINITY;
+        pairs.retain(|pair| {
+            let is_later = pair.0 - latest_s >= LEAST_STEP_S;
+            latest_s = if is_later { pair.0 } else { latest_s };
+            is_later
+        });
+        Self::of_steps(&pairs).or(of_each)
+    }
+
+    /// Slope of the steps from one pair (time, voltage, current) to the next.
+    fn of_steps(pairs: &[(f64, f64, f64)]) -> Option<Self> {
         // Over longer times, the state of charge also changes the voltage.
         let near = pairs.windows(2).filter(|pair| pair[1].0 - pair[0].0 <= 15.0);
         let steps: Vec<(f64, f64)> = near.map(|pair| (pair[1].2 - pair[0].2, pair[1].1 - pair[0].1)).collect();
@@ -127,6 +148,16 @@ mod tests {
     fn slope_ignores_a_wrong_reading() {
         let points = (1..20).map(|n| (f64::from(n), if n == 19 { 5.0 } else { -0.05 * f64::from(n) }));
         assert!((Slope::of(points).unwrap().ohm - 0.05).abs() < 1e-6);
+    }
+
+    #[test]
+    fn coarse_voltage_shows_slope_of_fast_readings() {
+        let current = |time_s: f64| 60.0 * (0.5 * time_s).sin();
+        let times = || (0..3000).map(|n| f64::from(n) * 0.01);
+        let amperes = Series::of(times().map(|t| (t, Ok(current(t)))));
+        let volts = Series::of(times().map(|t| (t, Ok((2.0 * (385.0 - 0.07 * current(t))).round() / 2.0))));
+        let slope = Slope::between(&volts, &amperes).unwrap();
+        assert!((slope.ohm - 0.07).abs() < 0.01 && slope.correlation() < -0.9, "{slope:?}");
     }
 
     #[test]

@@ -13,6 +13,7 @@ use crate::can::dbc::{Database, DbcError, Message, Signal};
 use crate::can::decode::{Binding, InputMap};
 use crate::can::j1939::parameter_group;
 use crate::can::signal::{LayoutFault, ValueType};
+use crate::can::unit::{Quantity, SignalUnit};
 use crate::config::document::{Faults, ReadFile, SourceLine, TablePlace, beside, meant_file};
 use crate::config::schema::RawTables;
 use crate::config::schema::did_you_mean;
@@ -338,7 +339,8 @@ impl<'d> Search<'_, 'd> {
         not_available.extend(source.not_available.iter().filter(|code| **code <= largest));
         not_available.sort_unstable();
         not_available.dedup();
-        let is_percent = signal.unit == "%" && matches!(channel, Channel::ReportedSoc | Channel::ReportedSoh);
+        let is_percent = SignalUnit::parse(&signal.unit).is_some_and(|unit| unit.quantity == Quantity::PERCENTAGE)
+            && matches!(channel, Channel::ReportedSoc | Channel::ReportedSoh);
         let usual_scale = if is_percent && !source.place.has("scale") { 0.01 } else { source.scale };
         let (scale, offset) = (sign * usual_scale, sign * source.offset);
         let is_direction = channel == Channel::CurrentDirection;
