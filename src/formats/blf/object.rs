@@ -64,7 +64,7 @@ pub(super) fn decode(kind: u32, object: &[u8], start_ns: i64, channels: &mut Cha
     Ok(match kind {
         CAN_MESSAGE | CAN_MESSAGE2 => Item::Frame { time, channel, frame: classic(body)? },
         CAN_FD_MESSAGE => Item::Frame { time, channel, frame: fd(body)? },
-        CAN_FD_MESSAGE_64 => Item::Frame { time, channel, frame: fd_64(body)? },
+        CAN_FD_MESSAGE_64 => Item::Frame { time, channel, frame: fd_64(body, header)? },
         CAN_ERROR_EXT => {
             // The flags say whether the controller states the kind of error.
             let class = if u32_at(body, 4, false) & 3 != 0 { PROTOCOL_ERROR } else { 0 };
@@ -100,16 +100,22 @@ fn fd(body: &[u8]) -> Result<Frame, String> {
     raw(id, remote, fd, data).check()
 }
 
-fn fd_64(body: &[u8]) -> Result<Frame, String> {
+fn fd_64(body: &[u8], header: usize) -> Result<Frame, String> {
     let (code, valid, id, flags) = (body[1], body[2], u32_at(body, 4, false), u32_at(body, 12, false));
     let fd = (flags & 0x1000 != 0).then_some((flags & 0x2000 != 0, flags & 0x4000 != 0));
     if flags & 0x10 != 0 {
         return raw(id, true, None, &[0; 8][..length_of_code(code, false)]).check();
     }
+    // Further fields may follow the payload. Their place counts from the start of the object.
+    let end = match usize::from(body[35]) {
+        0 => body.len(),
+        place => place.saturating_sub(header).min(body.len()),
+    };
     // As in Vector's own library, bytes that the object does not store are zero.
     let (len, mut data) = (usize::from(valid), [0; 64]);
-    data.iter_mut().zip(body[40..].iter().take(len)).for_each(|(to, from)| *to = *from);
-    raw(id, false, fd, data.get(..len).ok_or_else(|| missing(len, body.len() - 40))?).check()
+    let stored = body.get(40..end).unwrap_or_default();
+    data.iter_mut().zip(stored.iter().take(len)).for_each(|(to, from)| *to = *from);
+    raw(id, false, fd, data.get(..len).ok_or_else(|| missing(len, stored.len()))?).check()
 }
 
 fn raw(id: u32, remote: bool, fd: Option<(bool, bool)>, data: &[u8]) -> RawFrame<'_> {

@@ -118,8 +118,13 @@ fn bytes_that_are_not_stored_are_zero() {
     body.extend(0x3000_u32.to_le_bytes());
     body.resize(40, 0);
     body.extend([7; 48]);
-    let log = read(&file(&[object(101, 2, 0, &body)]));
-    assert_eq!(log.frames()[0].2, fd_frame(0x1234, &[&[7; 48][..], &[0; 16]].concat()));
+    // With the place of further fields behind the payload, and without it.
+    let place = 32 + body.len() as u8;
+    let further = [&body[..35], &[place], &body[36..], &[9; 8]].concat();
+    for body in [body, further] {
+        let log = read(&file(&[object(101, 2, 0, &body)]));
+        assert_eq!(log.frames()[0].2, fd_frame(0x1234, &[&[7; 48][..], &[0; 16]].concat()));
+    }
 }
 
 #[test]

@@ -20,8 +20,10 @@ use crate::Item;
 /// Beginning of a log of CARBUS or CANHacker, and its columns.
 const CARBUS: &[u8] = b"@ TEXT @";
 const CARBUS_COLUMNS: &[u8] = b"time(ms)\tbus\tflags\tid\tlen\tdata";
-/// Power of ten of a microsecond in ns.
+/// Units as powers of ten of a nanosecond.
 const MICROSECONDS: i32 = 3;
+const MILLISECONDS: i32 = 6;
+const SECONDS: i32 = 9;
 /// Number of rows from which their times tell the unit.
 const FEWEST_ROWS: usize = 20;
 const DAY_NS: i64 = 86_400_000_000_000;
@@ -31,8 +33,8 @@ const SHORTEST_FRAME_NS: i64 = 10_000;
 /// Meaning of a column.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Column {
-    /// Whole numbers are multiplied by 10 to this power and then are nanoseconds.
-    Time(i32),
+    /// Whole numbers times 10 to this power are nanoseconds. `None` = the rows show the unit.
+    Time(Option<i32>),
     Id,
     Extended,
     Kind,
@@ -49,8 +51,8 @@ pub(super) struct FrameTable {
     columns: Vec<Column>,
     separator: u8,
     base: Base,
-    /// Power of ten of whole numbers in microseconds, as the first rows show it.
-    whole: i32,
+    /// The power of [`Column::Time`] if the header states no unit.
+    unstated: i32,
     /// Start of the present day, and the latest time, for times of day.
     day_ns: i64,
     latest_ns: i64,
@@ -62,7 +64,7 @@ impl Grammar for FrameTable {
             columns: Vec::new(),
             separator: b',',
             base: Base::Hex,
-            whole: MICROSECONDS,
+            unstated: MICROSECONDS,
             day_ns: 0,
             latest_ns: 0,
         };
@@ -77,14 +79,14 @@ impl Grammar for FrameTable {
                 let Some(field) = line.field(log.separator) else { break };
                 match log.column(index) {
                     Column::Byte if is_three_digits(field) => log.base = Base::Dec,
-                    Column::Time(MICROSECONDS) if !field.contains(&b'.') => times.extend(scaled(field, MICROSECONDS)),
+                    Column::Time(None) if !field.contains(&b'.') => times.extend(scaled(field, MICROSECONDS)),
                     _ => {}
                 }
             }
         }
-        let span_ns = times.iter().max().zip(times.iter().min()).map_or(0, |(last, first)| last - first);
+        let span_ns = times.iter().max().zip(times.iter().min()).map_or(0, |(last, first)| last.saturating_sub(*first));
         let is_too_fast = times.len() >= FEWEST_ROWS && span_ns < times.len() as i64 * SHORTEST_FRAME_NS;
-        Ok(Self { columns: Vec::new(), whole: if is_too_fast { MICROSECONDS + 3 } else { MICROSECONDS }, ..log })
+        Ok(Self { columns: Vec::new(), unstated: if is_too_fast { MILLISECONDS } else { MICROSECONDS }, ..log })
     }
 
     fn recognises(line: &[u8]) -> bool {
@@ -157,11 +159,10 @@ impl FrameTable {
     }
 
     /// The time of a row; for a time of day, the time since midnight.
-    fn time_ns(&mut self, field: &[u8], power: i32) -> Option<i64> {
+    fn time_ns(&mut self, field: &[u8], power: Option<i32>) -> Option<i64> {
         if !field.contains(&b':') {
             let is_whole = !field.iter().any(|byte| matches!(byte, b'.' | b','));
-            let power = if power == MICROSECONDS { self.whole } else { power };
-            return scaled(field, if is_whole { power } else { 9 });
+            return scaled(field, if is_whole { power.unwrap_or(self.unstated) } else { SECONDS });
         }
         let mut parts = field.splitn(4, |byte| matches!(byte, b':' | b'.' | b','));
         let mut whole = || number(parts.next()?, Base::Dec).map(i64::from);
@@ -207,10 +208,10 @@ fn column(name: &[u8]) -> Column {
     let (name, unit) = name.split_once(['(', '[']).map_or((name.as_str(), ""), |(name, unit)| (name.trim(), unit));
     match name {
         "time" | "time stamp" | "timestamp" | "time scale" | "abs time" | "system time" => Column::Time(match unit {
-            _ if unit.starts_with("us") || unit.starts_with('µ') => MICROSECONDS,
-            _ if unit.starts_with('s') => 9,
-            "" if name == "time stamp" => MICROSECONDS,
-            _ => 6,
+            _ if unit.starts_with("us") || unit.starts_with('µ') => Some(MICROSECONDS),
+            _ if unit.starts_with('s') => Some(SECONDS),
+            "" if name == "time stamp" => None,
+            _ => Some(MILLISECONDS),
         }),
         "id" | "can id" | "frame id" | "identifier" | "addr" => Column::Id,
         "extended" | "frame format" => Column::Extended,
