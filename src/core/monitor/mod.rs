@@ -153,7 +153,8 @@ impl Monitor {
     /// Handles a frame: passes its readings to the stages, or executes its command.
     fn handle_frame(&mut self, received: ReceivedFrame<'_>, out: &mut Outputs) {
         let Self { config, clock, intake, stages, .. } = self;
-        let found = config.input.groups().configured(received.bus, received.frame, &mut intake.group_senders);
+        let found =
+            config.input.groups().configured(clock.now, received.bus, received.frame, &mut intake.group_senders);
         let received = match &found {
             GroupFrame::Other => received,
             GroupFrame::Configured(frame) => ReceivedFrame { frame, ..received },

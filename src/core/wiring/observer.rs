@@ -192,7 +192,7 @@ impl WiringObserver {
 
     /// Handles a frame from any interface.
     pub fn handle_frame(&mut self, time: Timestamp, bus: BusIndex, frame: &Frame) {
-        let found = self.groups.configured(bus, frame, &mut self.group_senders);
+        let found = self.groups.configured(time, bus, frame, &mut self.group_senders);
         let frame = if let GroupFrame::Configured(configured) = &found { configured } else { frame };
         self.note_time(time);
         self.frames += 1;

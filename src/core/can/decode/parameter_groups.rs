@@ -5,12 +5,16 @@
 //! configured messages belong to one group, each is found by its own identifier only. The same holds for groups with a
 //! destination, such as EF00, which any node uses for its own purposes.
 //!
-//! Several packs on one bus send the same groups. The frames of one of them are used ([`GroupSenders`]).
+//! Several packs on one bus send the same groups. The frames of one of them are used ([`GroupSenders`]). A sender may lose
+//! its address to another node and claim a new one.
 
 use super::Binding;
 use crate::can::j1939::{any_source, has_destination, parameter_group};
 use crate::can::{CanId, Frame};
-use crate::quantity::BusIndex;
+use crate::quantity::{BusIndex, Timestamp};
+
+/// Time without a frame after which another sender of a group is used (s): five frames of the slowest usual group.
+const SILENT_S: f64 = 5.0;
 
 /// The configured identifier of each parameter group that frames of any source address carry.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -36,15 +40,15 @@ impl ParameterGroups {
         Self { groups: alone.collect() }
     }
 
-    /// Finds the configured message that a frame carries.
+    /// Finds the configured message that a frame carries, which was received at `now`.
     #[inline]
-    pub fn configured(&self, bus: BusIndex, frame: &Frame, senders: &mut GroupSenders) -> GroupFrame {
+    pub fn configured(&self, now: Timestamp, bus: BusIndex, frame: &Frame, senders: &mut GroupSenders) -> GroupFrame {
         if self.groups.is_empty() {
             return GroupFrame::Other;
         }
         match self.find(bus, frame.id()) {
             None => GroupFrame::Other,
-            Some(id) if senders.is_chosen(bus, id, frame.id()) => GroupFrame::Configured(frame.with_id(id)),
+            Some(id) if senders.is_chosen(now, bus, id, frame.id()) => GroupFrame::Configured(frame.with_id(id)),
             Some(_) => GroupFrame::OfAnotherSender,
         }
     }
@@ -78,22 +82,36 @@ pub enum GroupFrame {
 }
 
 /// The sender that is used for each group: the configured source address as soon as it sends, until then the first
-/// address that sends the group. A restart begins anew.
+/// address that sends the group. If the sender is silent for 5 s, the next one is used. A restart begins anew.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct GroupSenders {
-    /// Interface, configured identifier, identifier of the sender in use.
-    chosen: Vec<(BusIndex, CanId, CanId)>,
+    chosen: Vec<ChosenSender>,
+}
+
+#[derive(Debug, Clone, PartialEq)]
+struct ChosenSender {
+    bus: BusIndex,
+    /// Identifier of the configured message.
+    configured: CanId,
+    source: u32,
+    latest: Timestamp,
 }
 
 impl GroupSenders {
-    fn is_chosen(&mut self, bus: BusIndex, configured: CanId, sent: CanId) -> bool {
+    fn is_chosen(&mut self, now: Timestamp, bus: BusIndex, configured: CanId, sent: CanId) -> bool {
         let source = |id: CanId| id.raw() & 0xFF;
-        match self.chosen.iter_mut().find(|(of, id, _)| (*of, *id) == (bus, configured)) {
-            None => self.chosen.push((bus, configured, sent)),
-            Some((.., chosen)) if source(sent) == source(configured) => *chosen = sent,
-            Some((.., chosen)) => return source(*chosen) == source(sent),
+        let sender = ChosenSender { bus, configured, source: source(sent), latest: now };
+        let Some(chosen) = self.chosen.iter_mut().find(|known| (known.bus, known.configured) == (bus, configured))
+        else {
+            self.chosen.push(sender);
+            return true;
+        };
+        let is_silent = now.since(chosen.latest) > SILENT_S;
+        if sender.source == chosen.source || sender.source == source(configured) || is_silent {
+            *chosen = sender;
+            return true;
         }
-        true
+        false
     }
 }
 
@@ -108,7 +126,8 @@ mod tests {
 
     fn found(bindings: &[Binding], id: CanId) -> Option<CanId> {
         let frame = Frame::classic(id, &[1, 2]).unwrap();
-        match ParameterGroups::new(bindings).configured(BusIndex(0), &frame, &mut GroupSenders::default()) {
+        let (now, mut senders) = (Timestamp::from_secs(0.0), GroupSenders::default());
+        match ParameterGroups::new(bindings).configured(now, BusIndex(0), &frame, &mut senders) {
             GroupFrame::Configured(configured) => {
                 assert_eq!(configured.data(), frame.data());
                 Some(configured.id())
@@ -122,13 +141,16 @@ mod tests {
     fn one_sender_of_group_is_used() {
         let groups = ParameterGroups::new(&[message(0x18FF_50FE, true)]);
         let mut senders = GroupSenders::default();
-        let mut is_used = |id: u32| {
+        let mut is_used = |(time_s, id): (f64, u32)| {
             let frame = Frame::classic(CanId::Extended(id), &[1]).unwrap();
-            matches!(groups.configured(BusIndex(0), &frame, &mut senders), GroupFrame::Configured(_))
+            let found = groups.configured(Timestamp::from_secs(time_s), BusIndex(0), &frame, &mut senders);
+            matches!(found, GroupFrame::Configured(_))
         };
-        // The first sender is used until the configured one sends.
-        assert_eq!([0x18FF_50F3, 0x18FF_50F4, 0x18FF_50F3].map(&mut is_used), [true, false, true]);
-        assert_eq!([0x18FF_50FE, 0x18FF_50F3, 0x18FF_50FE].map(&mut is_used), [true, false, true]);
+        let (a, b, configured) = (0x18FF_50F3, 0x18FF_50F4, 0x18FF_50FE);
+        // The first sender is used until it is silent or the configured one sends.
+        assert_eq!([(0.0, a), (1.0, b), (2.0, a), (6.9, b)].map(&mut is_used), [true, false, true, false]);
+        assert_eq!([(7.1, b), (7.2, a)].map(&mut is_used), [true, false], "the sender has claimed a new address");
+        assert_eq!([(8.0, configured), (9.0, b), (9.5, configured)].map(&mut is_used), [true, false, true]);
     }
 
     #[test]

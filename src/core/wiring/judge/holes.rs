@@ -86,7 +86,10 @@ fn of_inputs(judge: &mut Judge<'_>) {
             overlap_s > 0.8 * next.hole.seconds().max(other.hole.seconds())
         };
         match found.iter_mut().find(is_same) {
-            Some(other) => other.names.extend(next.names),
+            Some(other) => {
+                other.names.extend(next.names);
+                other.kinds.extend(next.kinds);
+            }
             None => found.push(next),
         }
     }
@@ -96,6 +99,7 @@ fn of_inputs(judge: &mut Judge<'_>) {
 /// A stretch in which inputs are missing. The signal and its period are those of the first input.
 struct MissingInput<'d> {
     names: Vec<String>,
+    kinds: Vec<Kind>,
     signal: &'d SignalPlan,
     period_s: f64,
     hole: Hole,
@@ -112,13 +116,20 @@ fn missing_input<'d>(judge: &Judge<'d>, kind: Kind) -> Option<MissingInput<'d>> 
         _ => channel(signal.binding.channel),
     };
     let hole = Hole { from: *from, to: from.plus_secs(*length_s) };
-    Some(MissingInput { names: vec![name], signal, period_s: series.period_s().unwrap_or(0.0), hole })
+    Some(MissingInput {
+        names: vec![name],
+        kinds: vec![kind],
+        signal,
+        period_s: series.period_s().unwrap_or(0.0),
+        hole,
+    })
 }
 
-fn report(judge: &mut Judge<'_>, MissingInput { names, signal, period_s, hole }: MissingInput<'_>) {
+fn report(judge: &mut Judge<'_>, MissingInput { names, kinds, signal, period_s, hole }: MissingInput<'_>) {
     let Some(first) = judge.observed.first else { return };
     // If current and voltages are missing together, the pack sleeps.
-    let is_asleep = names.len() > 1 && use_in(judge, &hole).is_none();
+    let is_all = kinds.contains(&Kind::Current) && kinds.contains(&Kind::Voltage);
+    let is_asleep = is_all && use_in(judge, &hole).is_none();
     let is_minor = is_asleep || Kind::of(signal.binding.channel) == Kind::Reported;
     let severity = if is_minor { Severity::Note } else { Severity::Warning };
     let why = match is_asleep {

@@ -53,7 +53,12 @@ fn j1939(format: &str) -> String {
 /// The identifier of the frame after its parameter group was looked up.
 fn configured(config: &Config, sent: u32) -> u32 {
     let frame = Frame::classic(CanId::Extended(sent), &[0; 8]).unwrap();
-    match config.monitor.input.groups().configured(BusIndex(0), &frame, &mut GroupSenders::default()) {
+    match config.monitor.input.groups().configured(
+        Timestamp::from_secs(0.0),
+        BusIndex(0),
+        &frame,
+        &mut GroupSenders::default(),
+    ) {
         GroupFrame::Configured(frame) => frame.id().raw(),
         GroupFrame::Other | GroupFrame::OfAnotherSender => sent,
     }
