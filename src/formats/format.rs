@@ -155,6 +155,10 @@ impl LogReader for UntilEnd {
         self.reader.position()
     }
 
+    fn remark(&self) -> Option<&'static str> {
+        self.reader.remark()
+    }
+
     fn channels(&self) -> &[Channel] {
         self.reader.channels()
     }

@@ -42,6 +42,11 @@ pub trait LogReader {
     /// Position of the item last returned, or of the damage.
     fn position(&self) -> Position;
 
+    /// What was assumed about the log, to be shown to the user.
+    fn remark(&self) -> Option<&'static str> {
+        None
+    }
+
     /// The channels found so far. An item's `channel` is an index into this list.
     fn channels(&self) -> &[Channel];
 }

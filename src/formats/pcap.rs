@@ -14,7 +14,7 @@ use packwatch_core::quantity::Timestamp;
 pub(crate) use self::next_generation::{PcapNgReader, SECTION_HEADER};
 use self::packet::{LinkType, PacketDecoder};
 use crate::byte_stream::{ByteStream, WINDOW, cut, damaged, u32_at};
-use crate::{Channel, Item, LogReader, Position, Source};
+use crate::{Channel, Format, Item, LogReader, Position, Source};
 
 /// Size of the file header, and of the header of a packet, bytes.
 const FILE_HEAD: usize = 24;
@@ -70,7 +70,11 @@ impl PcapReader {
             return Err(damaged(packet::other_link_type(number)));
         }
         packets.consume(FILE_HEAD);
-        Ok(Self { packets, form, link, decoder: PacketDecoder::default(), at: 0 })
+        let mut decoder = PacketDecoder::default();
+        if link == Some(LinkType::SocketCan) {
+            note_orders(packets.fill(Format::HEAD_BYTES)?, form, &mut decoder);
+        }
+        Ok(Self { packets, form, link, decoder, at: 0 })
     }
 
     fn next_packet(&mut self) -> io::Result<Option<Item>> {
@@ -97,6 +101,16 @@ impl PcapReader {
         let item = self.decoder.decode(self.link, bytes, self.form.big_endian, time, None);
         self.packets.consume(len);
         Ok(Some(item))
+    }
+}
+
+/// Shows the decoder the first packets, so that it knows the byte order of the identifiers.
+fn note_orders(mut packets: &[u8], form: Form, decoder: &mut PacketDecoder) {
+    while let Some((head, rest)) = packets.split_at_checked(PACKET_HEAD)
+        && let Some((packet, rest)) = rest.split_at_checked(u32_at(head, 8, form.big_endian) as usize)
+    {
+        decoder.note_order(packet, true);
+        packets = rest;
     }
 }
 

@@ -42,6 +42,11 @@ trait Grammar: Sized {
     /// Whether no other format has such a line. `line` may be a line of any file.
     fn recognises(line: &[u8]) -> bool;
 
+    /// What was assumed about the log.
+    fn remark(&self) -> Option<&'static str> {
+        None
+    }
+
     /// Reads a line.
     ///
     /// # Errors
@@ -132,6 +137,10 @@ impl<G: Grammar> LogReader for TextLog<G> {
 
     fn position(&self) -> Position {
         Position::Line(self.lines.number())
+    }
+
+    fn remark(&self) -> Option<&'static str> {
+        self.grammar.remark()
     }
 
     fn channels(&self) -> &[Channel] {

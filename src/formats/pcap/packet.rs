@@ -58,8 +58,8 @@ const FRAME_HEAD: usize = 8;
 #[derive(Debug, Default)]
 pub(super) struct PacketDecoder {
     pub(super) channels: ChannelList,
-    /// Whether the identifiers have the other byte order than the file should have.
-    is_swapped: bool,
+    /// Frames whose identifier shows the order that the file should have, minus frames that show the other order.
+    right_order: i32,
 }
 
 impl PacketDecoder {
@@ -136,14 +136,22 @@ impl PacketDecoder {
         Ok(Item::Frame { time, channel, frame })
     }
 
-    /// The identifier with its flags. Some recorders write the other byte order; the identifier of an 11-bit frame then
-    /// looks too large.
+    /// The identifier with its flags. Some recorders write it in the other byte order.
     fn identifier(&mut self, bytes: &[u8], big_endian: bool) -> u32 {
-        let read = |is_swapped: bool| u32_at(bytes, 0, big_endian != is_swapped);
-        let is_possible = |id: u32| id & EXTENDED != 0 || id & (ERROR - 1) <= 0x7FF;
-        if !is_possible(read(self.is_swapped)) && is_possible(read(!self.is_swapped)) {
-            self.is_swapped = !self.is_swapped;
-        }
-        read(self.is_swapped)
+        let [right, other] = [big_endian, !big_endian].map(|order| u32_at(bytes, 0, order));
+        self.right_order = self.right_order.saturating_add(i32::from(is_plain(right)) - i32::from(is_plain(other)));
+        if self.right_order < 0 { other } else { right }
     }
+
+    /// Notes the byte order of a frame without returning the frame.
+    pub(super) fn note_order(&mut self, frame: &[u8], big_endian: bool) {
+        if frame.len() >= FRAME_HEAD && frame[4] & XL == 0 {
+            self.identifier(frame, big_endian);
+        }
+    }
+}
+
+/// Whether this is the identifier of a usual frame: 11 bits or, with its mark, 29 bits of which the lower 16 are not zero.
+fn is_plain(id: u32) -> bool {
+    id <= 0x7FF || id & (EXTENDED | REMOTE | ERROR) == EXTENDED && id & 0xFFFF != 0
 }

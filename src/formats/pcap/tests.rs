@@ -101,9 +101,18 @@ fn both_byte_orders_and_units_give_same_frames() {
 }
 
 #[test]
-fn identifier_in_wrong_order_is_turned() {
-    let log = read(&pcap(false, false, 227, &[can(0x123_u32.to_le_bytes(), 0, &[1, 2, 3])]));
-    assert_eq!(log.items, items([0; 3])[..1]);
+fn identifiers_in_wrong_order_are_turned() {
+    let ids = [0x180, 0x280, 0x7E8, 0x123, 0x8000_1234_u32, 0x98FF_50F4];
+    let read_ids = |packets: &[Vec<u8>]| -> Vec<u32> {
+        let log = read(&pcap(false, false, 227, packets));
+        log.frames().into_iter().map(|(_, _, frame)| frame.id().raw()).collect()
+    };
+    let expected = ids.map(|id| id & 0x1FFF_FFFF);
+    assert_eq!(read_ids(&ids.map(|id| can(id.to_le_bytes(), 0, &[1]))), expected);
+    // One odd identifier does not turn the others.
+    let mut right = ids.map(|id| can(id.to_be_bytes(), 0, &[1])).to_vec();
+    right.insert(0, can([0x80, 0, 0, 0x10], 0, &[1]));
+    assert_eq!(read_ids(&right)[1..], expected);
 }
 
 #[test]

@@ -300,7 +300,8 @@ impl LogSource {
         #[cfg(feature = "formats")]
         if let Some(format) = ToolLog::recognise(&mut lines).map_err(failed)? {
             let log = ToolLog::open(format, lines, paths).map_err(failed)?;
-            self.state.counts.inputs.push(format!("{name}: {}", format.name()));
+            let remark = log.remark().map_or_else(String::new, |remark| format!(", {remark}"));
+            self.state.counts.inputs.push(format!("{name}: {}{remark}", format.name()));
             return Ok(OpenLog { name, form: LogForm::Tool(Box::new(log)) });
         }
         let first = lines.peek().map_err(failed)?.trim_ascii_end();

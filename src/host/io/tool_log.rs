@@ -53,6 +53,10 @@ impl ToolLog {
         self.reader.next_item()
     }
 
+    pub(super) fn remark(&self) -> Option<&'static str> {
+        self.reader.remark()
+    }
+
     pub(super) fn position(&self) -> Position {
         self.reader.position()
     }

@@ -280,6 +280,46 @@ fn tables_of_other_tools_give_their_frames() {
 }
 
 #[test]
+fn units_of_tables_follow_the_header() {
+    for (name, time) in [
+        ("Time (ms)", "1010.5"),
+        ("Time (ns)", "1010500000"),
+        ("Time (\u{3bc}s)", "1010500"),
+        ("Time (microseconds)", "1010500"),
+        ("timestamp[s]", "1.0105"),
+        ("Time", "00:01.0105"),
+        ("Time", "0:00:01.0105"),
+    ] {
+        check(&format!("{name},ID,DLC,Data\n{time},5EB,2,E845\n"), &["1.0105 0 5EB E8 45"]);
+    }
+    let rows = |times: &[&str]| times.iter().map(|time| format!("{time},5EB,1,E8\n")).collect::<String>();
+    let whole = rows(&["0.5", "1", "1.5"]);
+    check(&format!("time,ID,Len,Data\n{whole}"), &["0.5 0 5EB E8", "1 0 5EB E8", "1.5 0 5EB E8"]);
+    let unix = rows(&["1700000000", "1700000001", "1700000002"]);
+    check(&format!("time,ID,Len,Data\n{unix}"), &["1700000000 0 5EB E8", "1700000001 0 5EB E8", "1700000002 0 5EB E8"]);
+    for other in ["Time (min),ID,Len,Data", "Time,ID,Bus,Data,Current,Voltage", "Time,ID,Len,D1_V"] {
+        assert_eq!(Format::recognise(other.as_bytes()), None, "{other}");
+    }
+    let late = rows(&["23:59:59.9", "0:00:00", "23:59:59.95", "0:00:00.1"]);
+    let found = content(format!("Time,ID,Len,Data\n{late}").as_bytes());
+    assert_eq!(found, ["86399.9 0 5EB E8", "86400 0 5EB E8", "86399.95 0 5EB E8", "86400.1 0 5EB E8"]);
+}
+
+#[test]
+fn rows_of_tables_that_contradict_themselves_are_bad() {
+    let log = "Time,Frame Type,ID,Extended,DLC,Data\n0.1,Data,5EB,0,1,E845\n0.2,Error frame,5EB,0,2,E845\n0.3,Data,5EB,yes,9,010203040506070809101112\n0.4,Data,5EB,0,2,E845";
+    let found = content(log.as_bytes());
+    assert!(found[0].contains("as many data bytes as the row's length states"), "{found:?}");
+    assert_eq!(
+        found[1..],
+        ["0.2 0 error 0", "0.3 0 000005EB F 01 02 03 04 05 06 07 08 09 10 11 12", "0.4 0 5EB E8 45"]
+    );
+    let cut = content(b"time,addr,bus,data\n0.6,0x1A,0,0x0102");
+    assert!(cut[0].contains("a line end after the data"), "{cut:?}");
+    check("Time Stamp,ID,Extended,Bus,LEN,D1\n500000,1515,0,1,1,32,\n", &["0.5 1 5EB 20"]);
+}
+
+#[test]
 fn python_can_csv_rows_give_their_frames() {
     let header = "timestamp,arbitration_id,extended,remote,error,dlc,data\n";
     let rows = "2.5e-05,0x100,0,0,0,2,BQA=\n1.0,0x18ff1234,1,1,0,4,\n2.0,0x4,0,0,1,0,\n3.0,0x100,0,0,0,12,AQIDBAUGBwgJCgsM\n4.0,0x100,0,0,0,3,BQA=\n";
