@@ -12,7 +12,7 @@ use super::Survey;
 use super::survey::survey_with;
 use crate::wiring::{Change, Severity, Topic, WiringFinding, WiringReport};
 
-/// Maximum number of findings whose changes are tried, because every trial reads the logs again.
+/// Maximum number of trials, because every trial reads the logs again.
 const MAX_TRIALS: usize = 4;
 
 /// Tries the changes of the first findings. `judge` judges the input with another configuration; `None` = it cannot be
@@ -88,7 +88,10 @@ fn keep(finding: &mut WiringFinding, changes: &[Change], outcome: Outcome) {
     if !matches!(outcome, Outcome::Useless) {
         let is_first = finding.changes.is_empty();
         finding.changes.extend_from_slice(changes);
-        finding.changes[..1].iter_mut().for_each(|change| change.is_alternative &= !is_first);
+        if is_first {
+            // Without the proposals before it, this one is no alternative.
+            finding.changes[0].is_alternative = false;
+        }
     }
 }
 
@@ -107,6 +110,7 @@ fn counts(report: &WiringReport) -> BTreeMap<Subject, usize> {
     }
     counts
 }
+
 /// Whether the change states a value, and not only a description.
 fn is_exact(change: &Change) -> bool {
     change.place.is_some() && toml::from_str::<toml::Table>(&format!("{} = {}", change.key, change.proposed)).is_ok()

@@ -82,7 +82,8 @@ pub enum GroupFrame {
 }
 
 /// The sender that is used for each group: the configured source address as soon as it sends, until then the first
-/// address that sends the group. If the sender is silent for 5 s, the next one is used. A restart begins anew.
+/// address that sends the group. If the sender is silent for 5 s, an address that was not heard before replaces it. An
+/// address that was heard besides the sender belongs to another node. A restart begins anew.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct GroupSenders {
     chosen: Vec<ChosenSender>,
@@ -93,25 +94,32 @@ struct ChosenSender {
     bus: BusIndex,
     /// Identifier of the configured message.
     configured: CanId,
-    source: u32,
+    source: u8,
     latest: Timestamp,
+    /// Bit `n % 64` of word `n / 64`: address `n` belongs to another node.
+    others: [u64; 4],
 }
 
 impl GroupSenders {
     fn is_chosen(&mut self, now: Timestamp, bus: BusIndex, configured: CanId, sent: CanId) -> bool {
-        let source = |id: CanId| id.raw() & 0xFF;
-        let sender = ChosenSender { bus, configured, source: source(sent), latest: now };
+        let address = |id: CanId| id.raw().to_le_bytes()[0];
+        let source = address(sent);
         let Some(chosen) = self.chosen.iter_mut().find(|known| (known.bus, known.configured) == (bus, configured))
         else {
-            self.chosen.push(sender);
+            self.chosen.push(ChosenSender { bus, configured, source, latest: now, others: [0; 4] });
             return true;
         };
+        let is_heard = chosen.others[usize::from(source / 64)] & 1 << (source % 64) != 0;
         let is_silent = now.since(chosen.latest) > SILENT_S;
-        if sender.source == chosen.source || sender.source == source(configured) || is_silent {
-            *chosen = sender;
-            return true;
+        let is_used = source == chosen.source || source == address(configured) || is_silent && !is_heard;
+        let other = if is_used { std::mem::replace(&mut chosen.source, source) } else { source };
+        if other != chosen.source {
+            chosen.others[usize::from(other / 64)] |= 1 << (other % 64);
         }
-        false
+        if is_used {
+            chosen.latest = now;
+        }
+        is_used
     }
 }
 
@@ -146,11 +154,13 @@ mod tests {
             let found = groups.configured(Timestamp::from_secs(time_s), BusIndex(0), &frame, &mut senders);
             matches!(found, GroupFrame::Configured(_))
         };
-        let (a, b, configured) = (0x18FF_50F3, 0x18FF_50F4, 0x18FF_50FE);
+        let [a, b, c, d, later, configured] = [0xF3, 0xF4, 0x80, 0x81, 0x82, 0xFE].map(|source| 0x18FF_5000 + source);
         // The first sender is used until it is silent or the configured one sends.
-        assert_eq!([(0.0, a), (1.0, b), (2.0, a), (6.9, b)].map(&mut is_used), [true, false, true, false]);
-        assert_eq!([(7.1, b), (7.2, a)].map(&mut is_used), [true, false], "the sender has claimed a new address");
-        assert_eq!([(8.0, configured), (9.0, b), (9.5, configured)].map(&mut is_used), [true, false, true]);
+        assert_eq!([(0.0, a), (1.0, b), (2.0, a), (6.9, c)].map(&mut is_used), [true, false, true, false]);
+        assert_eq!([(8.0, b), (8.1, c)].map(&mut is_used), [false, false], "other nodes that were heard before");
+        assert_eq!([(8.2, d), (8.3, a)].map(&mut is_used), [true, false], "the sender has claimed a new address");
+        assert_eq!([(9.0, configured), (10.0, b), (11.0, configured)].map(&mut is_used), [true, false, true]);
+        assert_eq!([(17.0, d), (17.1, later)].map(&mut is_used), [false, true]);
     }
 
     #[test]

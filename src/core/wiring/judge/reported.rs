@@ -51,7 +51,7 @@ pub(super) fn check_charge(judge: &mut Judge<'_>) {
     if let Some((side, is_rise)) = side.filter(|_| !electrical::is_inverted(judge)) {
         // If the pack was only charged or only discharged, the sign may be inverted instead.
         let has_both = |slope: ChargeSlope| slope.rise.min(slope.fall) >= LEAST_RANGE;
-        let is_by_soc = found.is_some_and(|(_, slope)| slope.r2 < 0.8 && has_both(slope));
+        let is_by_soc = found.is_some_and(|(_, slope)| slope.r2 < EXPLAINED && has_both(slope));
         if is_by_soc || ocv::moves_against(judge, true) && ocv::moves_against(judge, false) {
             let verb = if is_rise { "rise" } else { "fall" };
             let what = if is_by_soc { "reported SOC and the voltages" } else { "voltages" };

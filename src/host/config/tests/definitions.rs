@@ -54,7 +54,7 @@ fn j1939(format: &str) -> String {
 fn configured(config: &Config, sent: u32) -> u32 {
     let frame = Frame::classic(CanId::Extended(sent), &[0; 8]).unwrap();
     match config.monitor.input.groups().configured(
-        Timestamp::from_secs(0.0),
+        crate::quantity::Timestamp::from_secs(0.0),
         BusIndex(0),
         &frame,
         &mut GroupSenders::default(),
