@@ -111,6 +111,8 @@ const fn screen_unit(unit: Unit) -> (&'static str, f64) {
         Unit::Amperes => (" A", 1.0),
         Unit::Celsius => (" °C", 1.0),
         Unit::AmpereHours => (" Ah", 1.0),
+        Unit::WattHours => (" kWh", 1e-3),
+        Unit::Watts => (" kW", 1e-3),
         Unit::Seconds => (" s", 1.0),
         Unit::Days => (" days", 1.0),
         Unit::Cycles => (" cycles", 1.0),

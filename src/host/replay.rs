@@ -251,7 +251,7 @@ impl Replay {
             write_estimates_header(file)?;
         }
         let want_estimates = sinks.estimates.is_some() || sinks.watch.is_some() || sinks.outputs.is_some();
-        let out = Outputs { want_estimates, ..Outputs::default() };
+        let out = Outputs { want_estimates, ignores_frames: sinks.frames.is_none(), ..Outputs::default() };
         Ok(Self {
             monitor,
             out,

@@ -63,8 +63,10 @@ fn description(branch: &str) -> &'static str {
                     position in array."
         }
         "CurrentSensor" => "The current sensor.",
+        "Energy" => "Energy and time to full and to empty.",
         "Loss" => "Losses of the weakest cell.",
         "Model" => "The cell model.",
+        "Power" => "Power that the pack can deliver or take up.",
         "RechargePeriod" => "Recharge period.",
         "RemainingLife" => "Remaining life of the cell that ends first.",
         "StateOfCharge" => "Additional signals of the state of charge.",

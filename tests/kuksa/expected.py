@@ -112,7 +112,7 @@ PACK_NUMBERS = {
     "CurrentSensor.OffsetStandardDeviation": "current_offset_std_a",
 }
 PACK_PERCENT = {
-    "StateOfCharge.StandardDeviation": "soc_std", "StateOfCharge.Low": "soc_low", "StateOfCharge.High": "soc_high",
+    "StateOfCharge.CurrentStandardDeviation": "soc_std", "StateOfCharge.Low": "soc_low", "StateOfCharge.High": "soc_high",
     "StateOfCharge.Reported": "reported_soc", "StateOfHealth.Learned": "soh", "StateOfHealth.LearnedStandardDeviation": "soh_std", "StateOfHealth.Reported": "reported_soh",
     "Loss.LithiumInventory": "lli", "Loss.LithiumInventoryStandardDeviation": "lli_std",
     "Loss.NegativeElectrode": "lam_ne", "Loss.NegativeElectrodeStandardDeviation": "lam_ne_std",

@@ -22,6 +22,6 @@ pub use layout::{
     LayoutBase, LayoutMessage, LayoutSettings, MessageSettings, REPLY_DELAY_MS, SettingFault, default_database, layout,
 };
 pub use message::PlanFaults;
-pub use output::{AlarmFields, HealthFields, OutputPlan, SendCounters, SentMessage, StatusFields};
+pub use output::{AlarmFields, HealthFields, OutlookFields, OutputPlan, SendCounters, SentMessage, StatusFields};
 pub use protector::InputProtector;
 pub use reply::{CommandRefusal, ReplyFields};

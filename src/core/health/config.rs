@@ -1,6 +1,8 @@
 //! Settings for learning at charge/discharge transitions. Each charge and each discharge is a half-cycle. The host's
 //! `config` module checks the ranges.
 
+use super::OutlookConfig;
+
 /// Settings for classifying the current as charge, rest or discharge.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TransitionConfig {
@@ -106,4 +108,6 @@ pub struct HealthConfig {
     pub end_of_life_ah: f64,
     /// Load for the usable capacity; `None` = the usable capacity is not computed.
     pub usable: Option<UsableConfig>,
+    /// Limits for energy, time and power.
+    pub outlook: OutlookConfig,
 }

@@ -11,6 +11,7 @@ pub mod forecast;
 mod half_cycle;
 pub mod learner;
 pub mod offset;
+pub mod outlook;
 pub mod pack;
 pub mod recharge;
 mod span;
@@ -23,6 +24,7 @@ pub use config::{
 pub use forecast::{Axis, CapacityReading, Forecast, InsufficientData, Remaining, RemainingLife, Usage};
 pub use half_cycle::HalfCycle;
 pub use learner::{CapacityUpdate, Learner, Lesson};
+pub use outlook::{OutlookConfig, RecentLoad};
 pub use pack::{CellShare, PackState};
 pub use recharge::{ChargeRecord, RechargeTimer};
 pub use transition::{ModeChange, TransitionDetector};

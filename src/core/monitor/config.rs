@@ -320,6 +320,7 @@ impl MonitorConfig {
             ("[capacity]", capacity(self) == capacity(new)),
             ("[recharge]", self.health.recharge == new.health.recharge),
             ("[usable]", self.health.usable == new.health.usable),
+            ("[outlook]", self.health.outlook == new.health.outlook),
             ("[[alarm]]", self.rules == new.rules),
             ("[output]", self.output == new.output),
             ("[commands]", self.commands == new.commands),

@@ -3,6 +3,7 @@
 //! Each stage owns its configuration and state; only this file knows the order of the stages. In all functions, `now`
 //! is the time of the input that is being handled.
 
+mod outlook;
 pub(crate) mod pack_memory;
 pub(crate) mod watch;
 
@@ -222,6 +223,11 @@ impl Stages {
     fn observe_current(&mut self, now: Timestamp, current_a: Option<f64>, out: &mut Outputs) {
         let Learning { config, state, .. } = &mut self.learning;
         let observed = state.detector.observe(&config.transition, now, current_a);
+        state.load.observe(
+            now,
+            state.detector.mode(),
+            current_a.map(|pack_a| pack_a / self.sampling.sampler.strings()),
+        );
         if observed.change.is_none() && !observed.candidate_begins {
             return;
         }
@@ -448,7 +454,9 @@ impl Stages {
             self.sending.send_status(now, &fields, out);
         }
         if is_health_due {
+            let outlook = if out.ignores_frames { None } else { self.outlook() };
             let fields = HealthFields {
+                outlook: outlook.as_ref().map(outlook::fields).unwrap_or_default(),
                 model_state: Some(self.modelling.view().state.code()),
                 ..self.learning.health_fields(&self.estimation.bank)
             };

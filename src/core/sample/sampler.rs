@@ -548,7 +548,8 @@ impl Sampler {
         self.state.latest
     }
 
-    fn strings(&self) -> f64 {
+    /// Number of parallel strings.
+    pub fn strings(&self) -> f64 {
         f64::from(self.config.strings.max(1))
     }
 

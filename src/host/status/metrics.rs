@@ -293,6 +293,8 @@ const fn metric_unit(unit: Unit) -> (&'static str, f64) {
         Unit::Amperes => ("amperes", 1.0),
         Unit::Celsius => ("celsius", 1.0),
         Unit::AmpereHours => ("amperehours", 1.0),
+        Unit::WattHours => ("joules", 3600.0),
+        Unit::Watts => ("watts", 1.0),
         Unit::Seconds => ("seconds", 1.0),
         Unit::Days => ("seconds", 86_400.0),
         Unit::Cycles => ("", 1.0),

@@ -134,18 +134,15 @@ fn signals_of(row: &'static QuantityRow, it: &'static Presentation, is_pack: boo
     })
 }
 
-/// The path of a mean or of a standard deviation. All standard deviations are in the overlay. If the mean is the VSS
-/// signal `BRANCH.NAME`, its standard deviation is `BRANCH.StandardDeviation`. If the mean is in the overlay,
-/// `StandardDeviation` is appended to its path.
+/// The path of a mean or of a standard deviation. A standard deviation is in the overlay and has the path of its mean,
+/// with `StandardDeviation` appended.
 fn path(path: VssPath, part: Part) -> (Origin, Cow<'static, str>) {
     match (path, part) {
         (VssPath::Standard(path), Part::Mean) => (Origin::Standard, path.into()),
         (VssPath::Overlay(path), Part::Mean) => (Origin::Overlay, path.into()),
-        (VssPath::Standard(path), Part::Std) => {
-            let branch = path.rsplit_once('.').map_or(path, |(branch, _)| branch);
-            (Origin::Overlay, format!("{branch}.StandardDeviation").into())
+        (VssPath::Standard(path) | VssPath::Overlay(path), Part::Std) => {
+            (Origin::Overlay, format!("{path}StandardDeviation").into())
         }
-        (VssPath::Overlay(path), Part::Std) => (Origin::Overlay, format!("{path}StandardDeviation").into()),
     }
 }
 
@@ -158,6 +155,8 @@ const fn vss_unit(unit: Unit) -> (Option<&'static str>, f64) {
         Unit::Amperes => (Some("A"), -1.0),
         Unit::Celsius => (Some("Celsius"), 1.0),
         Unit::AmpereHours => (Some("Ah"), 1.0),
+        Unit::WattHours => (Some("kWh"), 1e-3),
+        Unit::Watts => (Some("W"), 1.0),
         Unit::Seconds => (Some("s"), 1.0),
         Unit::Days => (Some("day"), 1.0),
     }

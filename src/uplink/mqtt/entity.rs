@@ -104,6 +104,8 @@ const fn measure(unit: Unit) -> (Measure, f64) {
         Unit::Amperes => ("A", "current", 3, -1.0),
         Unit::Celsius => ("°C", "temperature", 1, 1.0),
         Unit::AmpereHours => ("Ah", "", 3, 1.0),
+        Unit::WattHours => ("Wh", "energy_storage", 0, 1.0),
+        Unit::Watts => ("W", "power", 0, 1.0),
         Unit::Seconds => ("s", "duration", 0, 1.0),
         Unit::Days => ("d", "duration", 1, 1.0),
         Unit::Cycles => ("cycles", "", 1, 1.0),

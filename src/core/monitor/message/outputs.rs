@@ -114,6 +114,8 @@ pub struct Outputs {
     pub estimates: Vec<Estimate>,
     /// Whether the caller wants `estimates`.
     pub want_estimates: bool,
+    /// Whether nobody reads the frames. Values that are expensive to compute are then sent as unknown.
+    pub ignores_frames: bool,
     /// Inputs of the alarm engine; empty unless `want_alarm_inputs` is set. Not included: restored alarms and changed
     /// rules.
     pub alarm_inputs: Vec<(Timestamp, AlarmInput)>,

@@ -34,6 +34,9 @@ pub struct PackView {
     pub mode: Mode,
     /// The cell that is empty first.
     pub limiting_cell: Option<CellIndex>,
+    /// The cells that limit the power of a discharge and of a charge for 10 s.
+    #[serde(default)]
+    pub power_limiting_cells: Option<[CellIndex; 2]>,
     /// The cell with the lowest capacity, once every cell's capacity has been learned.
     pub weakest_cell: Option<CellIndex>,
     /// The cell with the shortest remaining life, once every cell's remaining life is known.

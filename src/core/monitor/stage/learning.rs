@@ -23,8 +23,8 @@ use crate::filter::{ScalarGaussian, square};
 use crate::health::recharge::normalised_period;
 use crate::health::usable::usable_capacity;
 use crate::health::{
-    CapacityUpdate, CellShare, HalfCycle, HealthConfig, Learner, Lesson, ModeChange, PackState, RechargeAlarm,
-    RechargeConfig, RechargeTimer, TransitionDetector, pack,
+    CapacityUpdate, CellShare, HalfCycle, HealthConfig, Learner, Lesson, ModeChange, PackState, RecentLoad,
+    RechargeAlarm, RechargeConfig, RechargeTimer, TransitionDetector, pack,
 };
 use crate::monitor::config::MonitorConfig;
 use crate::monitor::message::EventKind;
@@ -59,6 +59,7 @@ pub(crate) struct LearningState {
     pub(crate) recharge: RechargeTimer,
     pub(crate) recharge_period_s: Option<f64>,
     pub(crate) normalised_recharge: Option<ScalarGaussian>,
+    pub(crate) load: RecentLoad,
     pub(crate) pack: Option<PackState>,
 }
 
@@ -149,6 +150,7 @@ impl LearningState {
             *stamp = stamp.plus_nanos(by_nanos);
         }
         self.recharge.rebase(by_nanos);
+        self.load.rebase(by_nanos);
     }
 }
 
@@ -156,6 +158,7 @@ impl LearningState {
     pub(crate) fn check(&self) -> Result<(), InvalidState> {
         self.learner.check()?;
         self.recharge.check()?;
+        self.load.check()?;
         self.pack.iter().try_for_each(PackState::check)?;
         bounds::TIME_S.check_all("the recharge period", self.recharge_period_s)?;
         check_positive("the normalised recharge period", self.normalised_recharge)
@@ -451,7 +454,7 @@ impl Learning {
             lli: part(|losses| &losses.lithium),
             lam_ne: part(|losses| &losses.negative),
             lam_pe: part(|losses| &losses.positive),
-            model_state: None,
+            ..HealthFields::default()
         }
     }
 }

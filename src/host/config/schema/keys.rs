@@ -11,7 +11,7 @@ mod limits;
 mod pack;
 mod traffic;
 
-pub(crate) use algorithms::{Capacity, Estimator, Recharge, Transition, Usable};
+pub(crate) use algorithms::{Capacity, Estimator, Outlook, Recharge, Transition, Usable};
 pub(crate) use choices::{E2eKey, MethodKey, PositiveCurrent, SourceAddress, WireOrder};
 pub(crate) use input::{
     AnswerSignalKeys, BalancingInput, CellVoltageInput, ContactorInput, CurrentInput, CurrentSign, DiagnosticInput,

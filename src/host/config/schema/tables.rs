@@ -2,10 +2,10 @@
 
 use super::keys::{
     Alarm, AnswerSignalKeys, Authentication, BalancingInput, Capacity, CellVoltageInput, Commands, ContactorInput,
-    CurrentInput, CurrentLimits, CurrentSign, DiagnosticInput, Estimator, Input, Interface, J1939, Output, OutputAlarm,
-    OutputDigest, OutputFreshness, OutputHealth, OutputReply, OutputStatus, Pack, PackIdentityInput, PackModule,
-    PackVoltageInput, Poll, ProtectedInput, Recharge, ReportedSocInput, ReportedSohInput, SignalSource, Store,
-    SupplyVoltageInput, TemperatureInput, TemperatureLimits, Transition, Usable, Vehicle, VoltageLimits,
+    CurrentInput, CurrentLimits, CurrentSign, DiagnosticInput, Estimator, Input, Interface, J1939, Outlook, Output,
+    OutputAlarm, OutputDigest, OutputFreshness, OutputHealth, OutputReply, OutputStatus, Pack, PackIdentityInput,
+    PackModule, PackVoltageInput, Poll, ProtectedInput, Recharge, ReportedSocInput, ReportedSohInput, SignalSource,
+    Store, SupplyVoltageInput, TemperatureInput, TemperatureLimits, Transition, Usable, Vehicle, VoltageLimits,
 };
 use super::section::tables;
 use crate::cell::CellModel;
@@ -41,6 +41,7 @@ tables! {
         capacity: one Capacity,
         recharge: one Recharge,
         usable: optional Usable,
+        outlook: one Outlook,
         alarms: many Alarm,
         j1939: optional J1939,
         poll: one Poll,

@@ -5,7 +5,6 @@
 //! status document has no value for them:
 //!
 //! * `NetCapacity` and `GrossCapacity`: whole kWh, but the daemon learns Ah.
-//! * `StateOfCharge.CurrentEnergy` and the energies: the daemon estimates no energy.
 //! * The throughputs "over lifetime of the battery": the daemon knows only the time in which it ran.
 //! * `StateOfCharge.Displayed`: the value that the vehicle shows to the customer.
 //! * `Charging.IsCharging`: true only with a charger, but the daemon's mode `charge` includes braking.

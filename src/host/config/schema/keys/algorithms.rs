@@ -1,4 +1,4 @@
-//! Declares the tables of the algorithms: cell filter, transitions, capacity, recharge, usable capacity. Each table
+//! Declares the tables of the algorithms: cell filter, transitions, capacity, recharge, usable capacity, outlook. Each table
 //! gives the parameters of its algorithm. Defaults that depend on the cell or on other keys are also computed here.
 
 use super::choices::{DEVIATION, MethodKey, TEMPERATURE_C};
@@ -11,7 +11,9 @@ use crate::config::schema::key::ValueRange::{Above, Any, Between};
 use crate::config::schema::key::within;
 use crate::config::schema::section::section;
 use crate::filter::ScalarGaussian;
-use crate::health::{CapacityConfig, CapacityMethod, RechargeAlarm, RechargeConfig, TransitionConfig, UsableConfig};
+use crate::health::{
+    CapacityConfig, CapacityMethod, OutlookConfig, RechargeAlarm, RechargeConfig, TransitionConfig, UsableConfig,
+};
 use crate::quantity::bounds;
 
 /// Uncertainty of the open-circuit curve before the first half-cycle is measured. Until then, the cell is assumed to
@@ -292,5 +294,25 @@ section! {
         /// A charge is complete when its current, per cell, has dropped to this value at the cell model's highest voltage. Usable capacity is counted from the SOC at that moment.
         taper_current_a: Option<f64>, "A", Above(0.0, 1e6), Optional("C/20: the rated capacity over 20 h")
             => taper_current_a: keys.taper_current_a.unwrap_or(rated_ah / 20.0);
+    }
+}
+
+section! {
+    /// Limits for the remaining energy, the times to empty and to full, and the power.
+    Outlook at "outlook" gives OutlookConfig, |keys, usable: Option<UsableConfig>, rated_ah: f64| {
+        /// Lowest voltage of a cell under load.
+        min_voltage_v: Option<f64>, "V", Above(0.0, 100.0), Optional("`cutoff_v` of `[usable]`, else the cell model's lowest voltage")
+            => min_voltage_v: keys.min_voltage_v.or(usable.map(|usable| usable.cutoff_v));
+        /// Highest voltage of a cell under charge.
+        max_voltage_v: Option<f64>, "V", Above(0.0, 100.0), Optional("the cell model's highest voltage");
+        /// Largest discharge current, per cell.
+        max_discharge_a: Option<f64>, "A", Above(0.0, 1e6), Optional("only the voltages limit the current");
+        /// Largest charging current, per cell.
+        max_charge_a: Option<f64>, "A", Above(0.0, 1e6), Optional("only the voltages limit the current");
+        /// A charge is complete when its current, per cell, has dropped to this value at the highest voltage.
+        taper_current_a: Option<f64>, "A", Above(0.0, 1e6), Optional("`taper_current_a` of `[usable]`, C/20")
+            => taper_current_a: keys.taper_current_a.or(usable.map(|usable| usable.taper_current_a)).unwrap_or(rated_ah / 20.0);
+        /// State of charge for which the time of a charge is stated.
+        target_soc: f64, "fraction", Between(0.0, 1.0), Default("0.8");
     }
 }

@@ -1,0 +1,443 @@
+//! Outlook: energy, time and power that a pack can deliver or take up from now on.
+//!
+//! In: state and model of every cell ([`CellState`]), the recent load ([`RecentLoad`]) and the limits
+//! ([`OutlookConfig`]). Out: [`Outlook`] of the pack and [`CellOutlook`] of a cell, with variances. Currents are per
+//! cell, positive = discharge.
+//!
+//! * All cells of a series pack carry the same charge. A discharge ends when the first cell is empty, a charge when the
+//!   first cell is full. Energy is the integral of the cells' voltages over that charge, less the losses at the recent
+//!   load.
+//! * A charge continues at the recent current until the first cell reaches its highest voltage. From there on, the
+//!   current is the one that keeps the cell at this voltage, until it has fallen to the taper current.
+//! * Power is the largest constant current that keeps every cell within its voltages for a time, times the voltage at
+//!   the end of that time. It follows from the step response of the equivalent circuit.
+//!
+//! Variances are propagated to first order from SOC, capacity and resistance of the limiting cell.
+
+use serde::{Deserialize, Serialize};
+
+use crate::cell::{CellModel, GridPosition, MAX_BRANCHES};
+use crate::filter::{ScalarGaussian, bisect, square};
+use crate::quantity::{CellIndex, InvalidState, Mode, Timestamp};
+
+/// Times for which the power is stated (s).
+pub const POWER_S: [f64; 3] = [2.0, 10.0, 30.0];
+/// Time over which the load of a discharge is averaged (s): a drive in town, or a stretch between two stops of a bus.
+const LOAD_S: f64 = 600.0;
+/// Time over which the current of a charge is averaged (s). A charger regulates its current.
+const CHARGER_S: f64 = 60.0;
+/// Time without a current after which the averages skip the gap (s).
+const GAP_S: f64 = 60.0;
+/// Duration of the fluctuations of a load (s): a vehicle accelerates or brakes for about this long.
+const FLUCTUATION_S: f64 = 10.0;
+/// Load that is assumed before the first one was seen, per rated capacity (1/h): a vehicle that drives for five hours.
+const USUAL_LOAD_PER_H: f64 = 0.2;
+/// Number of intervals of an integral over the charge.
+const INTERVALS: u32 = 16;
+/// Number of steps of a charge.
+const CHARGE_STEPS: u32 = 64;
+
+/// Limits of a cell and the end of a charge.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct OutlookConfig {
+    /// Lowest voltage (V); `None` = the cell model's lowest voltage.
+    pub min_voltage_v: Option<f64>,
+    /// Highest voltage (V); `None` = the cell model's highest voltage.
+    pub max_voltage_v: Option<f64>,
+    /// Largest current of a discharge (A); `None` = only the voltages limit it.
+    pub max_discharge_a: Option<f64>,
+    /// Largest current of a charge (A); `None` = only the voltages limit it.
+    pub max_charge_a: Option<f64>,
+    /// A charge is complete when its current has fallen to this value (A).
+    pub taper_current_a: f64,
+    /// SOC for which the time of a charge is stated, fraction.
+    pub target_soc: f64,
+}
+
+/// Averages of the current while the pack is discharged, and while it is charged.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RecentLoad {
+    latest: Option<Timestamp>,
+    discharge: Average,
+    charge: Average,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Average {
+    /// Time that the average contains, at most the time of averaging (s).
+    seconds: f64,
+    mean_a: f64,
+    mean_square_a2: f64,
+}
+
+impl Average {
+    fn add(&mut self, current_a: f64, seconds: f64, window_s: f64) {
+        self.seconds = (self.seconds + seconds).min(window_s);
+        let weight = (seconds / self.seconds.max(f64::MIN_POSITIVE)).min(1.0);
+        self.mean_a += weight * (current_a - self.mean_a);
+        self.mean_square_a2 += weight * (square(current_a) - self.mean_square_a2);
+    }
+
+    /// The load, if it flows in the direction of `sign` and was seen for long enough.
+    fn load(&self, sign: f64) -> Option<Load> {
+        let mean_a = sign * self.mean_a;
+        let is_known = mean_a > 0.0 && self.seconds > 0.0;
+        is_known.then(|| Load { mean_a, mean_square_a2: self.mean_square_a2.max(square(mean_a)) })
+    }
+}
+
+impl RecentLoad {
+    /// Adds the current of a cell at `now`; `None` = the current is unknown.
+    pub fn observe(&mut self, now: Timestamp, mode: Mode, current_a: Option<f64>) {
+        let seconds = self.latest.map_or(0.0, |latest| now.since(latest));
+        self.latest = Some(now);
+        let Some(current_a) = current_a.filter(|_| seconds > 0.0 && seconds <= GAP_S) else { return };
+        match mode {
+            Mode::Discharge => self.discharge.add(current_a, seconds, LOAD_S),
+            Mode::Charge => self.charge.add(current_a, seconds, CHARGER_S),
+            Mode::Rest | Mode::Unknown => self.charge = Average::default(),
+        }
+    }
+
+    /// Shifts the time of the latest current by `by_nanos`, to another clock.
+    pub fn rebase(&mut self, by_nanos: i64) {
+        self.latest = self.latest.map(|latest| latest.plus_nanos(by_nanos));
+    }
+
+    /// Checks the numbers of a stored state.
+    ///
+    /// # Errors
+    /// The first impossible number.
+    pub fn check(&self) -> Result<(), InvalidState> {
+        [self.discharge, self.charge].iter().try_for_each(|average| {
+            InvalidState::unless_natural("the time of an averaged current", average.seconds)?;
+            InvalidState::unless_natural("the mean square of a current", average.mean_square_a2)?;
+            InvalidState::unless(average.mean_a.is_finite(), "a mean current", average.mean_a, "a finite number")
+        })
+    }
+}
+
+/// Mean and mean square of a current per cell, both positive.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Load {
+    mean_a: f64,
+    mean_square_a2: f64,
+}
+
+impl Load {
+    fn constant(mean_a: f64) -> Self {
+        Self { mean_a, mean_square_a2: square(mean_a) }
+    }
+
+    /// Voltage that is lost per charge (V): by the mean current in the settled circuit, and by its fluctuations in the
+    /// circuit's first response.
+    fn loss_v(&self, settled_ohm: f64, fast_ohm: f64) -> f64 {
+        let fluctuation_a = (self.mean_square_a2 - square(self.mean_a)) / self.mean_a;
+        self.mean_a * settled_ohm + fluctuation_a * fast_ohm
+    }
+}
+
+/// State of one cell.
+#[derive(Debug, Clone, Copy)]
+pub struct CellState<'a> {
+    pub model: &'a CellModel,
+    /// State of charge, fraction.
+    pub soc: ScalarGaussian,
+    /// Capacity (Ah).
+    pub capacity: ScalarGaussian,
+    /// ln of the resistance relative to the model.
+    pub log_resistance: ScalarGaussian,
+    /// Additional resistance ratio of the slowest branch.
+    pub slow_ratio: f64,
+    /// Voltages of the branches (V).
+    pub branch_v: [f64; MAX_BRANCHES],
+    /// Temperature (degrees C).
+    pub temperature_c: f64,
+}
+
+/// Direction of a current.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Direction {
+    Discharge,
+    Charge,
+}
+
+impl CellState<'_> {
+    fn position(&self, soc: f64) -> GridPosition {
+        self.model.grid_position(soc, self.temperature_c)
+    }
+
+    fn ocv_v(&self, soc: f64) -> f64 {
+        self.model.aged_ocv_v(&self.position(soc), self.capacity.mean)
+    }
+
+    /// Resistance (ohm) `after_s` after a step of the current.
+    fn ohm(&self, soc: f64, after_s: f64) -> f64 {
+        let (model, position) = (self.model, self.position(soc));
+        let slowest = model.branches.len() - 1;
+        let response = |i: usize| {
+            let ratio = if i == slowest { self.slow_ratio } else { 1.0 };
+            ratio * model.branch_r_ohm(i, &position) * (1.0 - libm::exp(-after_s / model.branch_tau_s(i, &position)))
+        };
+        libm::exp(self.log_resistance.mean) * (0..=slowest).fold(model.r0_ohm(&position), |sum, i| sum + response(i))
+    }
+
+    /// Voltage at a constant load after all branches have settled (V).
+    fn loaded_v(&self, soc: f64, load: &Load) -> f64 {
+        self.ocv_v(soc) - load.loss_v(self.ohm(soc, f64::INFINITY), self.ohm(soc, FLUCTUATION_S))
+    }
+
+    /// Charge (Ah) that the cell delivers until its voltage under this load falls to the lowest voltage.
+    fn dischargeable_ah(&self, load: &Load, config: &OutlookConfig) -> f64 {
+        let min_v = config.min_voltage_v.unwrap_or(self.model.voltage_min_v);
+        let soc = self.soc.mean;
+        let (_, empty) = bisect((0.0, soc.max(0.0)), 20, |soc| self.loaded_v(soc, load) < min_v);
+        let empty = if self.loaded_v(0.0, load) >= min_v { 0.0 } else { empty };
+        self.capacity.mean * (soc - empty).max(0.0)
+    }
+
+    /// Charge (Ah) that the cell takes up until it is full: until the taper current keeps it at its highest voltage.
+    fn chargeable_ah(&self, config: &OutlookConfig) -> f64 {
+        let soc = self.soc.mean;
+        let (full, _) = bisect((soc.min(1.0), 1.0), 20, |soc| self.held_a(soc, config) > config.taper_current_a);
+        let full = if self.held_a(1.0, config) > config.taper_current_a { 1.0 } else { full };
+        self.capacity.mean * (full - soc).max(0.0)
+    }
+
+    /// Charging current (A) that keeps the cell at its highest voltage.
+    fn held_a(&self, soc: f64, config: &OutlookConfig) -> f64 {
+        let max_v = config.max_voltage_v.unwrap_or(self.model.voltage_max_v);
+        (max_v - self.ocv_v(soc)) / self.ohm(soc, f64::INFINITY)
+    }
+
+    /// Energy (Wh) that the cell delivers with the charge `charge_ah` at this load.
+    fn delivered_wh(&self, charge_ah: f64, load: &Load) -> f64 {
+        let at = |part: f64| self.loaded_v(self.soc.mean - part * charge_ah / self.capacity.mean, load);
+        charge_ah * mean_of(at)
+    }
+
+    /// Energy (Wh) that the cell takes up with the charge `charge_ah` at a constant current.
+    fn taken_wh(&self, charge_ah: f64, current_a: f64, config: &OutlookConfig) -> f64 {
+        let max_v = config.max_voltage_v.unwrap_or(self.model.voltage_max_v);
+        let at = |part: f64| {
+            let soc = self.soc.mean + part * charge_ah / self.capacity.mean;
+            (self.ocv_v(soc) + current_a * self.ohm(soc, f64::INFINITY)).min(max_v)
+        };
+        charge_ah * mean_of(at)
+    }
+
+    /// Time (s) in which the cell takes up `charge_ah` from a charger that delivers `current_a` until the cell reaches
+    /// its highest voltage.
+    fn charging_s(&self, charge_ah: f64, current_a: f64, config: &OutlookConfig) -> f64 {
+        let step_ah = charge_ah / f64::from(CHARGE_STEPS);
+        (0..CHARGE_STEPS).fold(0.0, |sum_s, step| {
+            let soc = self.soc.mean + (f64::from(step) + 0.5) * step_ah / self.capacity.mean;
+            let held_a = self.held_a(soc, config).max(config.taper_current_a);
+            sum_s + 3600.0 * step_ah / current_a.min(held_a)
+        })
+    }
+
+    /// Voltage (V) `after_s` after the current has changed to `current_a`, positive = discharge.
+    fn voltage_after(&self, current_a: f64, after_s: f64) -> f64 {
+        let (model, position) = (self.model, self.position(self.soc.mean));
+        let moved = current_a * after_s / (3600.0 * self.capacity.mean);
+        let relaxed_v = (0..model.branches.len())
+            .map(|i| self.branch_v[i] * libm::exp(-after_s / model.branch_tau_s(i, &position)))
+            .sum::<f64>();
+        let middle = self.soc.mean - 0.5 * moved;
+        self.ocv_v(self.soc.mean - moved) - relaxed_v - current_a * self.ohm(middle, after_s)
+    }
+
+    /// Largest current (A, positive) in a direction that keeps the cell within its limits for `for_s`.
+    fn limit_a(&self, direction: Direction, for_s: f64, config: &OutlookConfig) -> f64 {
+        let full_a = 3600.0 * self.capacity.mean / for_s;
+        let (sign, room_a, max_a) = match direction {
+            Direction::Discharge => (1.0, self.soc.mean * full_a, config.max_discharge_a),
+            Direction::Charge => (-1.0, (1.0 - self.soc.mean) * full_a, config.max_charge_a),
+        };
+        let (min_v, max_v) = (config.min_voltage_v, config.max_voltage_v);
+        let within = |current_a: f64| {
+            let voltage_v = self.voltage_after(sign * current_a, for_s);
+            match direction {
+                Direction::Discharge => voltage_v >= min_v.unwrap_or(self.model.voltage_min_v),
+                Direction::Charge => voltage_v <= max_v.unwrap_or(self.model.voltage_max_v),
+            }
+        };
+        let most_a = max_a.unwrap_or(f64::INFINITY).min(room_a.max(0.0));
+        if within(most_a) { most_a } else { bisect((0.0, most_a), 20, within).0 }
+    }
+
+    /// Power (W, positive) after `after_s` of a constant current (A, positive) in a direction.
+    fn power_w(&self, direction: Direction, current_a: f64, after_s: f64) -> f64 {
+        let sign = if direction == Direction::Discharge { 1.0 } else { -1.0 };
+        current_a * self.voltage_after(sign * current_a, after_s).max(0.0)
+    }
+
+    /// A value of the cell with its variance. `value` is computed again with each of SOC, capacity and ln resistance one
+    /// standard deviation higher and lower.
+    fn spread(&self, value: impl Fn(&Self) -> f64) -> ScalarGaussian {
+        let half = |change: fn(&mut Self, f64)| {
+            let [low, high] = [-1.0, 1.0].map(|sigmas| {
+                let mut other = *self;
+                change(&mut other, sigmas);
+                value(&other)
+            });
+            square(0.5 * (high - low))
+        };
+        let variance = half(|cell, sigmas| cell.soc.mean = (cell.soc.mean + sigmas * cell.soc.std()).clamp(0.0, 1.0))
+            + half(|cell, sigmas| {
+                let capacity_ah = cell.capacity.mean + sigmas * cell.capacity.std();
+                cell.capacity.mean = capacity_ah.max(0.1 * cell.capacity.mean);
+            })
+            + half(|cell, sigmas| cell.log_resistance.mean += sigmas * cell.log_resistance.std());
+        ScalarGaussian { mean: value(self), variance }
+    }
+}
+
+/// Mean of `value` over 0 to 1, by the midpoint rule.
+fn mean_of(value: impl Fn(f64) -> f64) -> f64 {
+    let middle = |k: u32| (f64::from(k) + 0.5) / f64::from(INTERVALS);
+    (0..INTERVALS).map(|k| value(middle(k))).sum::<f64>() / f64::from(INTERVALS)
+}
+
+/// What a cell alone can deliver and take up.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CellOutlook {
+    /// Energy until the cell is empty, at the recent load (Wh).
+    pub remaining_wh: ScalarGaussian,
+    /// Power of a discharge for 10 s (W).
+    pub discharge_w: ScalarGaussian,
+    /// Power of a charge for 10 s (W).
+    pub charge_w: ScalarGaussian,
+}
+
+/// What the pack can deliver and take up.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Outlook {
+    /// Energy until the first cell is empty, at the recent load (Wh).
+    pub remaining_wh: ScalarGaussian,
+    /// Energy that the pack takes up until the first cell is full, at the recent current of the charge (Wh).
+    pub to_full_wh: ScalarGaussian,
+    /// Time until the first cell is empty at the recent load (s); `None` unless the pack is discharged.
+    pub to_empty_s: Option<ScalarGaussian>,
+    /// Time until the first cell is full, at the charger's recent current (s); `None` unless the pack is charged.
+    pub to_full_s: Option<ScalarGaussian>,
+    /// Time until the pack reaches the configured SOC (s); `None` unless the pack is charged.
+    pub to_target_s: Option<ScalarGaussian>,
+    /// Power of a discharge for each of [`POWER_S`] (W).
+    pub discharge_w: [ScalarGaussian; 3],
+    /// Power of a charge for each of [`POWER_S`] (W).
+    pub charge_w: [ScalarGaussian; 3],
+    /// The cells that limit the power of a discharge and of a charge for 10 s.
+    pub limiting_cells: [CellIndex; 2],
+}
+
+/// Structure of the pack.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Structure {
+    /// Cells in series per [`CellState`]: 1, or the number of cells if only the pack's total voltage is measured.
+    pub series_per_state: f64,
+    /// Parallel strings.
+    pub strings: f64,
+    /// State of charge of the pack, fraction.
+    pub soc: f64,
+    /// Capacity of the pack per string (Ah).
+    pub capacity_ah: f64,
+}
+
+/// Computes the outlook of a pack; `None` without cells.
+pub fn of_pack(
+    config: &OutlookConfig,
+    (load, mode): (&RecentLoad, Mode),
+    cells: &[CellState<'_>],
+    pack: &Structure,
+) -> Option<Outlook> {
+    let rated_ah = cells.first()?.model.rated_capacity_ah;
+    let (discharge, charge) = (load.discharge.load(1.0), load.charge.load(-1.0));
+    let drawn = discharge.unwrap_or(Load::constant(USUAL_LOAD_PER_H * rated_ah));
+    let charger_a = charge.map_or(USUAL_LOAD_PER_H * rated_ah, |charge| charge.mean_a);
+    let least = |charge_ah: &dyn Fn(&CellState<'_>) -> f64| {
+        let charges = cells.iter().map(|cell| (charge_ah(cell), cell));
+        charges.min_by(|a, b| a.0.total_cmp(&b.0))
+    };
+    let (drawn_ah, weakest) = least(&|cell| cell.dischargeable_ah(&drawn, config))?;
+    let (taken_ah, fullest) = least(&|cell| cell.chargeable_ah(config))?;
+    let per_cell = pack.strings * pack.series_per_state;
+    // The errors of all cells are taken as equal, because they share the current sensor and the model.
+    let whole = |one: ScalarGaussian, value: &dyn Fn(&CellState<'_>) -> f64| ScalarGaussian {
+        mean: per_cell * cells.iter().map(value).sum::<f64>(),
+        variance: square(per_cell * cells.len() as f64) * one.variance,
+    };
+    let remaining = weakest.spread(|cell| cell.delivered_wh(cell.dischargeable_ah(&drawn, config), &drawn));
+    let to_full = fullest.spread(|cell| cell.taken_wh(cell.chargeable_ah(config), charger_a, config));
+    let target_soc = fullest.soc.mean + (config.target_soc - pack.soc) * pack.capacity_ah / fullest.capacity.mean;
+    let to_target_s = |cell: &CellState<'_>| {
+        let charge_ah = (target_soc - cell.soc.mean) * cell.capacity.mean;
+        cell.charging_s(charge_ah.clamp(0.0, cell.chargeable_ah(config)), charger_a, config)
+    };
+    let is_charging = mode == Mode::Charge && charge.is_some();
+    let drawn_now = discharge.filter(|_| mode == Mode::Discharge);
+    let power = |direction, for_s| pack_power(config, direction, for_s, (cells, &whole));
+    let [discharges, charges] =
+        [Direction::Discharge, Direction::Charge].map(|direction| POWER_S.map(|for_s| power(direction, for_s)));
+    let limiting = |powers: &[(ScalarGaussian, usize); 3]| CellIndex(u16::try_from(powers[1].1).unwrap_or(u16::MAX));
+    Some(Outlook {
+        remaining_wh: whole(remaining, &|cell| cell.delivered_wh(drawn_ah, &drawn)),
+        to_full_wh: whole(to_full, &|cell| cell.taken_wh(taken_ah, charger_a, config)),
+        to_empty_s: drawn_now
+            .map(|load| weakest.spread(|cell| 3600.0 * cell.dischargeable_ah(&load, config) / load.mean_a)),
+        to_full_s: is_charging
+            .then(|| fullest.spread(|cell| cell.charging_s(cell.chargeable_ah(config), charger_a, config))),
+        to_target_s: is_charging.then(|| fullest.spread(to_target_s)),
+        discharge_w: discharges.map(|(power, _)| power),
+        charge_w: charges.map(|(power, _)| power),
+        limiting_cells: [limiting(&discharges), limiting(&charges)],
+    })
+}
+
+type Whole<'a> = &'a dyn Fn(ScalarGaussian, &dyn Fn(&CellState<'_>) -> f64) -> ScalarGaussian;
+
+/// Power of the pack (W), and the index of the cell that limits it.
+fn pack_power(
+    config: &OutlookConfig,
+    direction: Direction,
+    for_s: f64,
+    (cells, whole): (&[CellState<'_>], Whole<'_>),
+) -> (ScalarGaussian, usize) {
+    let limits = cells.iter().map(|cell| cell.limit_a(direction, for_s, config)).enumerate();
+    let (index, limit_a) = limits.min_by(|a, b| a.1.total_cmp(&b.1)).unwrap_or((0, 0.0));
+    let one = cells[index].spread(|cell| cell.power_w(direction, cell.limit_a(direction, for_s, config), for_s));
+    (whole(one, &|cell| cell.power_w(direction, limit_a, for_s)), index)
+}
+
+/// Computes the outlook of one cell, regardless of the other cells.
+pub fn of_cell(config: &OutlookConfig, load: &RecentLoad, cell: &CellState<'_>) -> CellOutlook {
+    let usual = Load::constant(USUAL_LOAD_PER_H * cell.model.rated_capacity_ah);
+    let drawn = load.discharge.load(1.0).unwrap_or(usual);
+    let power = |direction| {
+        let for_s = POWER_S[1];
+        cell.spread(|cell| cell.power_w(direction, cell.limit_a(direction, for_s, config), for_s))
+    };
+    CellOutlook {
+        remaining_wh: cell.spread(|cell| cell.delivered_wh(cell.dischargeable_ah(&drawn, config), &drawn)),
+        discharge_w: power(Direction::Discharge),
+        charge_w: power(Direction::Charge),
+    }
+}
+
+/// Energy of the full cell relative to a new cell of the rated capacity, both discharged in five hours.
+pub fn energy_health(config: &OutlookConfig, cell: &CellState<'_>) -> ScalarGaussian {
+    let load = Load::constant(USUAL_LOAD_PER_H * cell.model.rated_capacity_ah);
+    let exact = |mean: f64| ScalarGaussian { mean, variance: 0.0 };
+    let energy_wh = |cell: &CellState<'_>| {
+        let full = CellState { soc: exact(1.0), ..*cell };
+        full.delivered_wh(full.dischargeable_ah(&load, config), &load)
+    };
+    let model = cell.model;
+    let new = CellState { capacity: exact(model.capacity_ah), log_resistance: exact(0.0), slow_ratio: 1.0, ..*cell };
+    let new_wh = energy_wh(&new) * model.rated_capacity_ah / model.capacity_ah;
+    let aged = CellState { soc: exact(1.0), ..*cell }.spread(energy_wh);
+    ScalarGaussian { mean: aged.mean / new_wh, variance: aged.variance / square(new_wh) }
+}

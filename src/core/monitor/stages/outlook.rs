@@ -1,0 +1,59 @@
+//! Energy, time and power of the pack and its cells, from the states of the stages. They are computed on demand, for a
+//! view or a frame.
+
+use super::Stages;
+use crate::can::encode::OutlookFields;
+use crate::filter::ScalarGaussian;
+use crate::health::outlook::{CellState, Outlook, Structure, of_pack};
+use crate::sample::VoltageSource;
+
+/// One-sided 95 % quantile of the normal distribution.
+const Z95_ONE_SIDED: f64 = 1.645;
+
+impl Stages {
+    /// Energy, time and power of the pack; `None` unless the state of every cell is known.
+    pub(crate) fn outlook(&self) -> Option<Outlook> {
+        let Self { sampling, estimation, learning, .. } = self;
+        let pack = learning.state.pack.as_ref()?;
+        let cells: Vec<_> = (0..estimation.cells()).map(|index| self.cell_state(index)).collect::<Option<_>>()?;
+        let (config, sampler) = (&learning.config.outlook, &sampling.sampler);
+        let series_per_state = match sampler.config().voltage_source {
+            VoltageSource::Cells => 1.0,
+            VoltageSource::PackTotal { series } => f64::from(series),
+        };
+        let (soc, capacity_ah) = (pack.soc, pack.capacity_ah);
+        let structure = Structure { series_per_state, strings: sampler.strings(), soc, capacity_ah };
+        of_pack(config, (&learning.state.load, learning.mode()), &cells, &structure)
+    }
+
+    /// State from which the outlook of a cell is computed; `None` before its first estimate, or without a temperature.
+    pub(crate) fn cell_state(&self, index: usize) -> Option<CellState<'_>> {
+        let bank = &self.estimation.bank;
+        let estimator = bank.cell(index);
+        Some(CellState {
+            model: bank.model(index),
+            soc: bank.soc(index)?,
+            capacity: self.learning.capacity(index),
+            log_resistance: estimator.log_resistance(),
+            slow_ratio: estimator.slow_ratio(bank.config(index)).mean,
+            branch_v: estimator.branch_v(),
+            temperature_c: bank.temperature_c(index)?,
+        })
+    }
+}
+
+/// The fields of the health frame. A receiver that uses the whole stated power keeps the limits in 95 % of all cases.
+pub(super) fn fields(outlook: &Outlook) -> OutlookFields {
+    let mean = |value: Option<ScalarGaussian>| value.map(|value| value.mean);
+    let low = |power: ScalarGaussian| Some((power.mean - Z95_ONE_SIDED * power.std()).max(0.0));
+    OutlookFields {
+        remaining_wh: [outlook.remaining_wh.mean, outlook.remaining_wh.std()].map(Some),
+        to_full_wh: Some(outlook.to_full_wh.mean),
+        to_empty_s: mean(outlook.to_empty_s),
+        to_full_s: mean(outlook.to_full_s),
+        to_target_s: mean(outlook.to_target_s),
+        discharge_w: outlook.discharge_w.map(low),
+        charge_w: outlook.charge_w.map(low),
+        limiting_cells: Some(outlook.limiting_cells),
+    }
+}
