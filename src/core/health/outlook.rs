@@ -22,16 +22,19 @@ use crate::quantity::{CellIndex, InvalidState, Mode, Timestamp};
 
 /// Times for which the power is stated (s).
 pub const POWER_S: [f64; 3] = [2.0, 10.0, 30.0];
-/// Time over which the load of a discharge is averaged (s): a drive in town, or a stretch between two stops of a bus.
-const LOAD_S: f64 = 600.0;
-/// Time over which the current of a charge is averaged (s). A charger regulates its current.
+/// Time over which the load of a discharge is averaged (s). Over half an hour, fast and slow parts of a drive mix.
+const LOAD_S: f64 = 1800.0;
+/// Standard deviation of ln(future load over recent load): a driver needs a third more or less in the next half hour.
+const LOG_LOAD_STD: f64 = 0.3;
+/// Time over which the current of a charge is averaged (s). A charger regulates its current. A longer gap without a
+/// current is not averaged.
 const CHARGER_S: f64 = 60.0;
-/// Time without a current after which the averages skip the gap (s).
-const GAP_S: f64 = 60.0;
-/// Duration of the fluctuations of a load (s): a vehicle accelerates or brakes for about this long.
-const FLUCTUATION_S: f64 = 10.0;
 /// Load that is assumed before the first one was seen, per rated capacity (1/h): a vehicle that drives for five hours.
 const USUAL_LOAD_PER_H: f64 = 0.2;
+/// Halvings of a search for a SOC: 0.02 %.
+const HALVINGS: u32 = 12;
+/// Steps of the search for the current at a voltage limit. The SOC moves by less than 1 % in 30 s at 1C.
+const CURRENT_STEPS: u32 = 4;
 /// Number of intervals of an integral over the charge.
 const INTERVALS: u32 = 16;
 /// Number of steps of a charge.
@@ -70,6 +73,8 @@ struct Average {
     seconds: f64,
     mean_a: f64,
     mean_square_a2: f64,
+    /// Largest current; it falls to the mean in the time of averaging (A).
+    peak_a: f64,
 }
 
 impl Average {
@@ -78,27 +83,38 @@ impl Average {
         let weight = (seconds / self.seconds.max(f64::MIN_POSITIVE)).min(1.0);
         self.mean_a += weight * (current_a - self.mean_a);
         self.mean_square_a2 += weight * (square(current_a) - self.mean_square_a2);
+        self.peak_a = current_a.max(self.peak_a + weight * (self.mean_a - self.peak_a));
     }
 
-    /// The load, if it flows in the direction of `sign` and was seen for long enough.
-    fn load(&self, sign: f64) -> Option<Load> {
-        let mean_a = sign * self.mean_a;
+    /// The load of a discharge, if one was seen.
+    fn load(&self) -> Option<Load> {
+        let Self { mean_a, mean_square_a2, peak_a, .. } = *self;
         let is_known = mean_a > 0.0 && self.seconds > 0.0;
-        is_known.then(|| Load { mean_a, mean_square_a2: self.mean_square_a2.max(square(mean_a)) })
+        is_known.then(|| Load {
+            mean_a,
+            mean_square_a2: mean_square_a2.max(square(mean_a)),
+            peak_a: peak_a.max(mean_a),
+        })
     }
 }
 
 impl RecentLoad {
-    /// Adds the current of a cell at `now`; `None` = the current is unknown.
-    pub fn observe(&mut self, now: Timestamp, mode: Mode, current_a: Option<f64>) {
+    /// Adds the current of a cell at `now`; `None` = the current is unknown. A current up to `rest_a` is no load.
+    pub fn observe(&mut self, now: Timestamp, mode: Mode, current_a: Option<f64>, rest_a: f64) {
         let seconds = self.latest.map_or(0.0, |latest| now.since(latest));
         self.latest = Some(now);
-        let Some(current_a) = current_a.filter(|_| seconds > 0.0 && seconds <= GAP_S) else { return };
+        let Some(current_a) = current_a.filter(|_| seconds > 0.0 && seconds <= CHARGER_S) else { return };
         match mode {
-            Mode::Discharge => self.discharge.add(current_a, seconds, LOAD_S),
-            Mode::Charge => self.charge.add(current_a, seconds, CHARGER_S),
-            Mode::Rest | Mode::Unknown => self.charge = Average::default(),
+            Mode::Charge => self.charge.add(-current_a, seconds, CHARGER_S),
+            Mode::Rest if current_a.abs() <= rest_a => self.charge = Average::default(),
+            // A load that changes its direction within seconds has no mode, but is a load.
+            Mode::Discharge | Mode::Rest | Mode::Unknown => self.discharge.add(current_a, seconds, LOAD_S),
         }
+    }
+
+    /// The charger's current (A, positive), if the pack is being charged.
+    fn charger_a(&self, mode: Mode) -> Option<f64> {
+        Some(self.charge.mean_a).filter(|current_a| mode == Mode::Charge && *current_a > 0.0)
     }
 
     /// Shifts the time of the latest current by `by_nanos`, to another clock.
@@ -114,21 +130,27 @@ impl RecentLoad {
         [self.discharge, self.charge].iter().try_for_each(|average| {
             InvalidState::unless_natural("the time of an averaged current", average.seconds)?;
             InvalidState::unless_natural("the mean square of a current", average.mean_square_a2)?;
-            InvalidState::unless(average.mean_a.is_finite(), "a mean current", average.mean_a, "a finite number")
+            InvalidState::unless_numbers("a mean or largest current", [average.mean_a, average.peak_a])
         })
     }
 }
 
-/// Mean and mean square of a current per cell, both positive.
+/// A load per cell: mean, mean square and largest current, positive.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Load {
     mean_a: f64,
     mean_square_a2: f64,
+    peak_a: f64,
 }
 
 impl Load {
     fn constant(mean_a: f64) -> Self {
-        Self { mean_a, mean_square_a2: square(mean_a) }
+        Self { mean_a, mean_square_a2: square(mean_a), peak_a: mean_a }
+    }
+
+    /// The load before one was seen; its largest current is 1C.
+    fn usual(rated_ah: f64) -> Self {
+        Self { peak_a: rated_ah, ..Self::constant(USUAL_LOAD_PER_H * rated_ah) }
     }
 
     /// Voltage that is lost per charge (V): by the mean current in the settled circuit, and by its fluctuations in the
@@ -136,6 +158,11 @@ impl Load {
     fn loss_v(&self, settled_ohm: f64, fast_ohm: f64) -> f64 {
         let fluctuation_a = (self.mean_square_a2 - square(self.mean_a)) / self.mean_a;
         self.mean_a * settled_ohm + fluctuation_a * fast_ohm
+    }
+
+    /// Voltage drop at the largest current (V).
+    fn peak_v(&self, settled_ohm: f64, fast_ohm: f64) -> f64 {
+        self.mean_a * settled_ohm + (self.peak_a - self.mean_a) * fast_ohm
     }
 }
 
@@ -184,24 +211,58 @@ impl CellState<'_> {
         libm::exp(self.log_resistance.mean) * (0..=slowest).fold(model.r0_ohm(&position), |sum, i| sum + response(i))
     }
 
-    /// Voltage at a constant load after all branches have settled (V).
-    fn loaded_v(&self, soc: f64, load: &Load) -> f64 {
-        self.ocv_v(soc) - load.loss_v(self.ohm(soc, f64::INFINITY), self.ohm(soc, FLUCTUATION_S))
+    /// Voltage (V) at a load: the mean, and the lowest at the largest current.
+    fn loaded_v(&self, soc: f64, load: &Load) -> (f64, f64) {
+        let (ocv_v, settled_ohm, fast_ohm) =
+            (self.ocv_v(soc), self.ohm(soc, f64::INFINITY), self.ohm(soc, POWER_S[1]));
+        (ocv_v - load.loss_v(settled_ohm, fast_ohm), ocv_v - load.peak_v(settled_ohm, fast_ohm))
     }
 
-    /// Charge (Ah) that the cell delivers until its voltage under this load falls to the lowest voltage.
-    fn dischargeable_ah(&self, load: &Load, config: &OutlookConfig) -> f64 {
+    /// SOC at which the voltage at the largest current of the load falls to the lowest voltage.
+    fn empty_soc(&self, load: &Load, config: &OutlookConfig) -> f64 {
         let min_v = config.min_voltage_v.unwrap_or(self.model.voltage_min_v);
-        let soc = self.soc.mean;
-        let (_, empty) = bisect((0.0, soc.max(0.0)), 20, |soc| self.loaded_v(soc, load) < min_v);
-        let empty = if self.loaded_v(0.0, load) >= min_v { 0.0 } else { empty };
-        self.capacity.mean * (soc - empty).max(0.0)
+        let is_empty = |soc: f64| self.loaded_v(soc, load).1 < min_v;
+        if is_empty(0.0) { bisect((0.0, 1.0), HALVINGS, is_empty).1 } else { 0.0 }
+    }
+
+    /// Charge (Ah) that the cell delivers at this load until it is empty.
+    fn dischargeable_ah(&self, load: &Load, config: &OutlookConfig) -> f64 {
+        self.capacity.mean * (self.soc.mean - self.empty_soc(load, config)).max(0.0)
+    }
+
+    /// Charge (Ah) and energy (Wh) that the cell delivers until it is empty, with variances. Resistance and load have
+    /// the same effect: on the voltage, and on the SOC of the empty cell.
+    fn remaining(&self, load: &Load, config: &OutlookConfig) -> [ScalarGaussian; 2] {
+        let (capacity_ah, soc) = (self.capacity.mean, self.soc.mean);
+        let empty = self.empty_soc(load, config);
+        let charge_ah = capacity_ah * (soc - empty).max(0.0);
+        let energy_wh = self.delivered_wh(charge_ah, load);
+        let (now_v, _) = self.loaded_v(soc, load);
+        let (end_v, end_peak_v) = self.loaded_v(empty, load);
+        let slope_v = (self.loaded_v(empty + 0.01, load).1 - end_peak_v) / 0.01;
+        let peak_drop_v = self.ocv_v(empty) - end_peak_v;
+        let empty_by_log = if empty > 0.0 && slope_v > 0.0 { (peak_drop_v / slope_v).min(1.0) } else { 0.0 };
+        let loss_wh = charge_ah * (mean_of(|part| self.ocv_v(soc + part * (empty - soc)))) - energy_wh;
+        let log_variance = self.log_resistance.variance + square(LOG_LOAD_STD);
+        let variance = |by_soc: f64, by_log: f64, value: f64| {
+            square(by_soc) * self.soc.variance
+                + square(value / capacity_ah) * self.capacity.variance
+                + square(by_log) * log_variance
+        };
+        let by_log_ah = capacity_ah * empty_by_log;
+        [
+            ScalarGaussian { mean: charge_ah, variance: variance(capacity_ah, by_log_ah, charge_ah) },
+            ScalarGaussian {
+                mean: energy_wh,
+                variance: variance(capacity_ah * now_v, loss_wh + by_log_ah * end_v, energy_wh),
+            },
+        ]
     }
 
     /// Charge (Ah) that the cell takes up until it is full: until the taper current keeps it at its highest voltage.
     fn chargeable_ah(&self, config: &OutlookConfig) -> f64 {
         let soc = self.soc.mean;
-        let (full, _) = bisect((soc.min(1.0), 1.0), 20, |soc| self.held_a(soc, config) > config.taper_current_a);
+        let (full, _) = bisect((soc.min(1.0), 1.0), HALVINGS, |soc| self.held_a(soc, config) > config.taper_current_a);
         let full = if self.held_a(1.0, config) > config.taper_current_a { 1.0 } else { full };
         self.capacity.mean * (full - soc).max(0.0)
     }
@@ -214,7 +275,7 @@ impl CellState<'_> {
 
     /// Energy (Wh) that the cell delivers with the charge `charge_ah` at this load.
     fn delivered_wh(&self, charge_ah: f64, load: &Load) -> f64 {
-        let at = |part: f64| self.loaded_v(self.soc.mean - part * charge_ah / self.capacity.mean, load);
+        let at = |part: f64| self.loaded_v(self.soc.mean - part * charge_ah / self.capacity.mean, load).0;
         charge_ah * mean_of(at)
     }
 
@@ -239,40 +300,51 @@ impl CellState<'_> {
         })
     }
 
-    /// Voltage (V) `after_s` after the current has changed to `current_a`, positive = discharge.
-    fn voltage_after(&self, current_a: f64, after_s: f64) -> f64 {
+    /// Open-circuit voltage less the relaxing branches (V), and resistance (ohm), `after_s` after the current has changed
+    /// to `current_a`, positive = discharge.
+    fn response(&self, current_a: f64, after_s: f64) -> (f64, f64) {
         let (model, position) = (self.model, self.position(self.soc.mean));
         let moved = current_a * after_s / (3600.0 * self.capacity.mean);
-        let relaxed_v = (0..model.branches.len())
+        let relaxing_v = (0..model.branches.len())
             .map(|i| self.branch_v[i] * libm::exp(-after_s / model.branch_tau_s(i, &position)))
             .sum::<f64>();
-        let middle = self.soc.mean - 0.5 * moved;
-        self.ocv_v(self.soc.mean - moved) - relaxed_v - current_a * self.ohm(middle, after_s)
+        (self.ocv_v(self.soc.mean - moved) - relaxing_v, self.ohm(self.soc.mean - 0.5 * moved, after_s))
     }
 
-    /// Largest current (A, positive) in a direction that keeps the cell within its limits for `for_s`.
-    fn limit_a(&self, direction: Direction, for_s: f64, config: &OutlookConfig) -> f64 {
-        let full_a = 3600.0 * self.capacity.mean / for_s;
-        let (sign, room_a, max_a) = match direction {
-            Direction::Discharge => (1.0, self.soc.mean * full_a, config.max_discharge_a),
-            Direction::Charge => (-1.0, (1.0 - self.soc.mean) * full_a, config.max_charge_a),
-        };
-        let (min_v, max_v) = (config.min_voltage_v, config.max_voltage_v);
-        let within = |current_a: f64| {
-            let voltage_v = self.voltage_after(sign * current_a, for_s);
-            match direction {
-                Direction::Discharge => voltage_v >= min_v.unwrap_or(self.model.voltage_min_v),
-                Direction::Charge => voltage_v <= max_v.unwrap_or(self.model.voltage_max_v),
+    /// Largest current (A, positive) in a direction that keeps the cell within its limits for `for_s`, and the
+    /// standard deviation of this current.
+    fn limit_a(&self, direction: Direction, for_s: f64, config: &OutlookConfig) -> ScalarGaussian {
+        let per_soc_a = 3600.0 * self.capacity.mean / for_s;
+        let (sign, room, max_a, limit_v) = match direction {
+            Direction::Discharge => {
+                (1.0, self.soc.mean, config.max_discharge_a, config.min_voltage_v.unwrap_or(self.model.voltage_min_v))
+            }
+            Direction::Charge => {
+                let limit_v = config.max_voltage_v.unwrap_or(self.model.voltage_max_v);
+                (-1.0, 1.0 - self.soc.mean, config.max_charge_a, limit_v)
             }
         };
-        let most_a = max_a.unwrap_or(f64::INFINITY).min(room_a.max(0.0));
-        if within(most_a) { most_a } else { bisect((0.0, most_a), 20, within).0 }
+        let most_a = max_a.unwrap_or(f64::INFINITY).min(per_soc_a * room.max(0.0));
+        let (mut current_a, mut ohm) = (0.0, 0.0);
+        for _ in 0..CURRENT_STEPS {
+            let (open_v, after_ohm) = self.response(sign * current_a, for_s);
+            current_a = (sign * (open_v - limit_v) / after_ohm).clamp(0.0, most_a);
+            ohm = after_ohm;
+        }
+        if current_a >= most_a {
+            let by_room_a = if max_a.is_some_and(|max_a| max_a <= most_a) { 0.0 } else { per_soc_a };
+            return ScalarGaussian { mean: most_a, variance: square(by_room_a) * self.soc.variance };
+        }
+        let slope_v = self.model.ocv_slope_v(&self.position(self.soc.mean), self.capacity.mean);
+        let variance = square(slope_v / ohm) * self.soc.variance + square(current_a) * self.log_resistance.variance;
+        ScalarGaussian { mean: current_a, variance }
     }
 
-    /// Power (W, positive) after `after_s` of a constant current (A, positive) in a direction.
-    fn power_w(&self, direction: Direction, current_a: f64, after_s: f64) -> f64 {
-        let sign = if direction == Direction::Discharge { 1.0 } else { -1.0 };
-        current_a * self.voltage_after(sign * current_a, after_s).max(0.0)
+    /// Voltage (V) after `after_s` of a current in a direction (A, positive).
+    fn voltage_after(&self, direction: Direction, current_a: f64, after_s: f64) -> f64 {
+        let signed_a = if direction == Direction::Discharge { current_a } else { -current_a };
+        let (open_v, ohm) = self.response(signed_a, after_s);
+        (open_v - signed_a * ohm).max(0.0)
     }
 
     /// A value of the cell with its variance. `value` is computed again with each of SOC, capacity and ln resistance one
@@ -355,76 +427,71 @@ pub fn of_pack(
     pack: &Structure,
 ) -> Option<Outlook> {
     let rated_ah = cells.first()?.model.rated_capacity_ah;
-    let (discharge, charge) = (load.discharge.load(1.0), load.charge.load(-1.0));
-    let drawn = discharge.unwrap_or(Load::constant(USUAL_LOAD_PER_H * rated_ah));
-    let charger_a = charge.map_or(USUAL_LOAD_PER_H * rated_ah, |charge| charge.mean_a);
+    let discharge = load.discharge.load();
+    let drawn = discharge.unwrap_or(Load::usual(rated_ah));
+    let charger_a = load.charger_a(mode).unwrap_or(USUAL_LOAD_PER_H * rated_ah);
     let least = |charge_ah: &dyn Fn(&CellState<'_>) -> f64| {
         let charges = cells.iter().map(|cell| (charge_ah(cell), cell));
         charges.min_by(|a, b| a.0.total_cmp(&b.0))
     };
     let (drawn_ah, weakest) = least(&|cell| cell.dischargeable_ah(&drawn, config))?;
     let (taken_ah, fullest) = least(&|cell| cell.chargeable_ah(config))?;
-    let per_cell = pack.strings * pack.series_per_state;
-    // The errors of all cells are taken as equal, because they share the current sensor and the model.
-    let whole = |one: ScalarGaussian, value: &dyn Fn(&CellState<'_>) -> f64| ScalarGaussian {
-        mean: per_cell * cells.iter().map(value).sum::<f64>(),
-        variance: square(per_cell * cells.len() as f64) * one.variance,
+    let sum = |value: &dyn Fn(&CellState<'_>) -> f64| {
+        pack.strings * pack.series_per_state * cells.iter().map(value).sum::<f64>()
     };
-    let remaining = weakest.spread(|cell| cell.delivered_wh(cell.dischargeable_ah(&drawn, config), &drawn));
+    // The errors of all cells count as equal, because they share the current sensor and the model.
+    let whole = |one: ScalarGaussian, value: &dyn Fn(&CellState<'_>) -> f64| ScalarGaussian {
+        mean: sum(value),
+        variance: square(sum(&|_| 1.0)) * one.variance,
+    };
+    let [charge, energy] = weakest.remaining(&drawn, config);
     let to_full = fullest.spread(|cell| cell.taken_wh(cell.chargeable_ah(config), charger_a, config));
+    let to_empty_s = discharge.filter(|_| mode == Mode::Discharge).map(|load| {
+        let per_ah_s = 3600.0 / load.mean_a;
+        let variance = square(per_ah_s) * charge.variance + square(per_ah_s * charge.mean * LOG_LOAD_STD);
+        ScalarGaussian { mean: per_ah_s * charge.mean, variance }
+    });
     let target_soc = fullest.soc.mean + (config.target_soc - pack.soc) * pack.capacity_ah / fullest.capacity.mean;
     let to_target_s = |cell: &CellState<'_>| {
         let charge_ah = (target_soc - cell.soc.mean) * cell.capacity.mean;
         cell.charging_s(charge_ah.clamp(0.0, cell.chargeable_ah(config)), charger_a, config)
     };
-    let is_charging = mode == Mode::Charge && charge.is_some();
-    let drawn_now = discharge.filter(|_| mode == Mode::Discharge);
-    let power = |direction, for_s| pack_power(config, direction, for_s, (cells, &whole));
-    let [discharges, charges] =
-        [Direction::Discharge, Direction::Charge].map(|direction| POWER_S.map(|for_s| power(direction, for_s)));
-    let limiting = |powers: &[(ScalarGaussian, usize); 3]| CellIndex(u16::try_from(powers[1].1).unwrap_or(u16::MAX));
+    let is_charging = load.charger_a(mode).is_some();
+    let power = |direction, for_s| {
+        let limits = cells.iter().map(|cell| cell.limit_a(direction, for_s, config)).enumerate();
+        let (index, limit) = limits.min_by(|a, b| a.1.mean.total_cmp(&b.1.mean))?;
+        let voltage_v = sum(&|cell| cell.voltage_after(direction, limit.mean, for_s));
+        let power = ScalarGaussian { mean: limit.mean * voltage_v, variance: square(voltage_v) * limit.variance };
+        Some((power, CellIndex(u16::try_from(index).unwrap_or(u16::MAX))))
+    };
+    let powers = |direction| {
+        let [short, middle, long] = POWER_S.map(|for_s| power(direction, for_s));
+        Some(([short?.0, middle?.0, long?.0], middle?.1))
+    };
+    let (discharge, charge) = (powers(Direction::Discharge)?, powers(Direction::Charge)?);
     Some(Outlook {
-        remaining_wh: whole(remaining, &|cell| cell.delivered_wh(drawn_ah, &drawn)),
+        remaining_wh: whole(energy, &|cell| cell.delivered_wh(drawn_ah, &drawn)),
         to_full_wh: whole(to_full, &|cell| cell.taken_wh(taken_ah, charger_a, config)),
-        to_empty_s: drawn_now
-            .map(|load| weakest.spread(|cell| 3600.0 * cell.dischargeable_ah(&load, config) / load.mean_a)),
+        to_empty_s,
         to_full_s: is_charging
             .then(|| fullest.spread(|cell| cell.charging_s(cell.chargeable_ah(config), charger_a, config))),
         to_target_s: is_charging.then(|| fullest.spread(to_target_s)),
-        discharge_w: discharges.map(|(power, _)| power),
-        charge_w: charges.map(|(power, _)| power),
-        limiting_cells: [limiting(&discharges), limiting(&charges)],
+        discharge_w: discharge.0,
+        charge_w: charge.0,
+        limiting_cells: [discharge.1, charge.1],
     })
-}
-
-type Whole<'a> = &'a dyn Fn(ScalarGaussian, &dyn Fn(&CellState<'_>) -> f64) -> ScalarGaussian;
-
-/// Power of the pack (W), and the index of the cell that limits it.
-fn pack_power(
-    config: &OutlookConfig,
-    direction: Direction,
-    for_s: f64,
-    (cells, whole): (&[CellState<'_>], Whole<'_>),
-) -> (ScalarGaussian, usize) {
-    let limits = cells.iter().map(|cell| cell.limit_a(direction, for_s, config)).enumerate();
-    let (index, limit_a) = limits.min_by(|a, b| a.1.total_cmp(&b.1)).unwrap_or((0, 0.0));
-    let one = cells[index].spread(|cell| cell.power_w(direction, cell.limit_a(direction, for_s, config), for_s));
-    (whole(one, &|cell| cell.power_w(direction, limit_a, for_s)), index)
 }
 
 /// Computes the outlook of one cell, regardless of the other cells.
 pub fn of_cell(config: &OutlookConfig, load: &RecentLoad, cell: &CellState<'_>) -> CellOutlook {
-    let usual = Load::constant(USUAL_LOAD_PER_H * cell.model.rated_capacity_ah);
-    let drawn = load.discharge.load(1.0).unwrap_or(usual);
+    let drawn = load.discharge.load().unwrap_or(Load::usual(cell.model.rated_capacity_ah));
     let power = |direction| {
-        let for_s = POWER_S[1];
-        cell.spread(|cell| cell.power_w(direction, cell.limit_a(direction, for_s, config), for_s))
+        let limit = cell.limit_a(direction, POWER_S[1], config);
+        let voltage_v = cell.voltage_after(direction, limit.mean, POWER_S[1]);
+        ScalarGaussian { mean: limit.mean * voltage_v, variance: square(voltage_v) * limit.variance }
     };
-    CellOutlook {
-        remaining_wh: cell.spread(|cell| cell.delivered_wh(cell.dischargeable_ah(&drawn, config), &drawn)),
-        discharge_w: power(Direction::Discharge),
-        charge_w: power(Direction::Charge),
-    }
+    let [_, remaining_wh] = cell.remaining(&drawn, config);
+    CellOutlook { remaining_wh, discharge_w: power(Direction::Discharge), charge_w: power(Direction::Charge) }
 }
 
 /// Energy of the full cell relative to a new cell of the rated capacity, both discharged in five hours.
@@ -441,3 +508,6 @@ pub fn energy_health(config: &OutlookConfig, cell: &CellState<'_>) -> ScalarGaus
     let aged = CellState { soc: exact(1.0), ..*cell }.spread(energy_wh);
     ScalarGaussian { mean: aged.mean / new_wh, variance: aged.variance / square(new_wh) }
 }
+
+#[cfg(test)]
+mod tests;

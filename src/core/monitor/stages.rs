@@ -223,11 +223,9 @@ impl Stages {
     fn observe_current(&mut self, now: Timestamp, current_a: Option<f64>, out: &mut Outputs) {
         let Learning { config, state, .. } = &mut self.learning;
         let observed = state.detector.observe(&config.transition, now, current_a);
-        state.load.observe(
-            now,
-            state.detector.mode(),
-            current_a.map(|pack_a| pack_a / self.sampling.sampler.strings()),
-        );
+        let strings = self.sampling.sampler.strings();
+        let rest_a = config.transition.dead_band_a / strings;
+        state.load.observe(now, state.detector.mode(), current_a.map(|pack_a| pack_a / strings), rest_a);
         if observed.change.is_none() && !observed.candidate_begins {
             return;
         }
@@ -455,8 +453,9 @@ impl Stages {
         }
         if is_health_due {
             let outlook = if out.ignores_frames { None } else { self.outlook() };
+            let energy_soh = outlook.and_then(|_| self.energy_soh()).map(|soh| soh.mean);
             let fields = HealthFields {
-                outlook: outlook.as_ref().map(outlook::fields).unwrap_or_default(),
+                outlook: outlook.as_ref().map(|outlook| outlook::fields(outlook, energy_soh)).unwrap_or_default(),
                 model_state: Some(self.modelling.view().state.code()),
                 ..self.learning.health_fields(&self.estimation.bank)
             };

@@ -305,9 +305,7 @@ impl Monitor {
         values.set(Quantity::NormalisedRechargePeriod, learning.state.normalised_recharge);
         set_losses(&mut values, weakest_cell.and_then(|cell| self.loss_modes(cell)));
         set_remaining_life(&mut values, life.map(|(_, life)| life));
-        let weakest_state = weakest.and_then(|(index, _)| self.stages.cell_state(index));
-        let energy_soh = weakest_state.map(|state| outlook::energy_health(&learning.config.outlook, &state));
-        values.set(Quantity::EnergySoh, energy_soh);
+        values.set(Quantity::EnergySoh, self.stages.energy_soh());
         let outlook = self.stages.outlook();
         set_outlook(&mut values, outlook.as_ref());
         PackView {

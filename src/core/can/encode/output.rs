@@ -36,7 +36,7 @@ const STATUS: SignalTable<StatusFields, 8> = [
 ];
 
 /// Signals of the health frame, on any page; the first [`HEALTH_REQUIRED`] are required.
-const HEALTH: SignalTable<HealthFields, 32> = [
+const HEALTH: SignalTable<HealthFields, 33> = [
     ("Capacity", |f| f.capacity_ah),
     ("CapacityStd", |f| f.capacity_std_ah),
     ("Soh", |f| f.soh),
@@ -58,6 +58,7 @@ const HEALTH: SignalTable<HealthFields, 32> = [
     ("RemainingEnergy", |f| f.outlook.remaining_wh[0]),
     ("RemainingEnergyStd", |f| f.outlook.remaining_wh[1]),
     ("EnergyToFull", |f| f.outlook.to_full_wh),
+    ("EnergySoh", |f| f.outlook.energy_soh),
     ("TimeToEmpty", |f| f.outlook.to_empty_s),
     ("TimeToFull", |f| f.outlook.to_full_s),
     ("TimeToTarget", |f| f.outlook.to_target_s),
@@ -142,6 +143,8 @@ pub struct OutlookFields {
     pub remaining_wh: [Option<f64>; 2],
     /// Energy until the pack is full (Wh).
     pub to_full_wh: Option<f64>,
+    /// State of health by energy, fraction.
+    pub energy_soh: Option<f64>,
     /// Time until the pack is empty (s).
     pub to_empty_s: Option<f64>,
     /// Time until the pack is full (s).

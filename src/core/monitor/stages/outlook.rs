@@ -4,11 +4,8 @@
 use super::Stages;
 use crate::can::encode::OutlookFields;
 use crate::filter::ScalarGaussian;
-use crate::health::outlook::{CellState, Outlook, Structure, of_pack};
+use crate::health::outlook::{CellState, Outlook, Structure, energy_health, of_pack};
 use crate::sample::VoltageSource;
-
-/// One-sided 95 % quantile of the normal distribution.
-const Z95_ONE_SIDED: f64 = 1.645;
 
 impl Stages {
     /// Energy, time and power of the pack; `None` unless the state of every cell is known.
@@ -24,6 +21,12 @@ impl Stages {
         let (soc, capacity_ah) = (pack.soc, pack.capacity_ah);
         let structure = Structure { series_per_state, strings: sampler.strings(), soc, capacity_ah };
         of_pack(config, (&learning.state.load, learning.mode()), &cells, &structure)
+    }
+
+    /// State of health by energy of the cell with the least capacity; `None` until every capacity has been learned.
+    pub(crate) fn energy_soh(&self) -> Option<ScalarGaussian> {
+        let (index, _) = self.learning.weakest()?;
+        Some(energy_health(&self.learning.config.outlook, &self.cell_state(index)?))
     }
 
     /// State from which the outlook of a cell is computed; `None` before its first estimate, or without a temperature.
@@ -43,12 +46,14 @@ impl Stages {
 }
 
 /// The fields of the health frame. A receiver that uses the whole stated power keeps the limits in 95 % of all cases.
-pub(super) fn fields(outlook: &Outlook) -> OutlookFields {
+pub(super) fn fields(outlook: &Outlook, energy_soh: Option<f64>) -> OutlookFields {
     let mean = |value: Option<ScalarGaussian>| value.map(|value| value.mean);
-    let low = |power: ScalarGaussian| Some((power.mean - Z95_ONE_SIDED * power.std()).max(0.0));
+    // 95 % is at 1.645 standard deviations.
+    let low = |power: ScalarGaussian| Some((power.mean - 1.645 * power.std()).max(0.0));
     OutlookFields {
         remaining_wh: [outlook.remaining_wh.mean, outlook.remaining_wh.std()].map(Some),
         to_full_wh: Some(outlook.to_full_wh.mean),
+        energy_soh,
         to_empty_s: mean(outlook.to_empty_s),
         to_full_s: mean(outlook.to_full_s),
         to_target_s: mean(outlook.to_target_s),

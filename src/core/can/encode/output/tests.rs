@@ -2,7 +2,9 @@
 
 use super::*;
 use crate::can::e2e::Profile;
-use crate::can::encode::{E2eSetting, LayoutBase, LayoutSettings, MessageSettings, default_database, layout};
+use crate::can::encode::{
+    E2eSetting, LayoutBase, LayoutSettings, MessageSettings, RatedPack, default_database, layout,
+};
 use crate::quantity::Fault;
 
 const TEXT: &str = include_str!("../../../../../config/packwatch.dbc");
@@ -394,7 +396,7 @@ fn messages_are_protected_with_separate_counters() {
         };
         let settings =
             LayoutSettings { status: settings(1), health: settings(2), alarm: settings(3), ..Default::default() };
-        let database = layout(LayoutBase::BuiltIn { rated_capacity_ah: 2.6 }, &settings).unwrap();
+        let database = layout(LayoutBase::BuiltIn(RatedPack { capacity_ah: 2.6, energy_wh: 9.6 }), &settings).unwrap();
         let plan = OutputPlan::new(&database).unwrap();
         let protections: Vec<_> = plan.messages().filter_map(|sent| sent.protection).collect();
         let [status, health, alarm] = protections[..] else { panic!("three are protected") };
@@ -422,7 +424,10 @@ fn counters_survive_restart_and_profile_change() {
     let protection = Protection { profile: Profile::P01A, data_id: 9 };
     let status = MessageSettings { e2e: E2eSetting::On(protection), ..Default::default() };
     let settings = LayoutSettings { status, ..Default::default() };
-    let plan = OutputPlan::new(&layout(LayoutBase::BuiltIn { rated_capacity_ah: 2.6 }, &settings).unwrap()).unwrap();
+    let plan = OutputPlan::new(
+        &layout(LayoutBase::BuiltIn(RatedPack { capacity_ah: 2.6, energy_wh: 9.6 }), &settings).unwrap(),
+    )
+    .unwrap();
     let stored = r#"{"status":200,"health":0,"alarm":3,"digest":0,"reply":0}"#;
     let mut counters: SendCounters = serde_json::from_str(stored).unwrap();
     let frames = [(); 2].map(|()| plan.status(&StatusFields::default(), &mut counters));

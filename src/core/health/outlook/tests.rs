@@ -1,0 +1,197 @@
+use super::*;
+use crate::cell::Discretisation;
+use crate::cell::circuit::{BranchAt, soc_after, terminal_v};
+use crate::cell::model::tests::small_model;
+
+const CONFIG: OutlookConfig = OutlookConfig {
+    min_voltage_v: None,
+    max_voltage_v: None,
+    max_discharge_a: None,
+    max_charge_a: None,
+    taper_current_a: 0.1,
+    target_soc: 0.8,
+};
+
+fn cell(model: &CellModel, soc: f64) -> CellState<'_> {
+    let exact = |mean: f64| ScalarGaussian { mean, variance: 0.0 };
+    CellState {
+        model,
+        soc: exact(soc),
+        capacity: exact(2.0),
+        log_resistance: exact(0.0),
+        slow_ratio: 1.0,
+        branch_v: [0.0; MAX_BRANCHES],
+        temperature_c: 0.0,
+    }
+}
+
+fn loaded(mode: Mode, current_a: f64) -> RecentLoad {
+    let mut load = RecentLoad::default();
+    (0..100).for_each(|second| load.observe(Timestamp::from_secs(f64::from(second)), mode, Some(current_a), 0.05));
+    load
+}
+
+fn of_one(cell: CellState<'_>, (mode, current_a): (Mode, f64)) -> Outlook {
+    let pack = Structure { series_per_state: 1.0, strings: 1.0, soc: cell.soc.mean, capacity_ah: cell.capacity.mean };
+    of_pack(&CONFIG, (&loaded(mode, current_a), mode), &[cell], &pack).unwrap()
+}
+
+/// The circuit at 0 degrees C, simulated in steps of 0.1 s.
+struct Circuit<'a> {
+    model: &'a CellModel,
+    soc: f64,
+    branch_v: f64,
+}
+
+impl Circuit<'_> {
+    fn voltage_v(&self, current_a: f64) -> f64 {
+        terminal_v(self.model, &self.model.grid_position(self.soc, 0.0), 1.0, self.branch_v, current_a)
+    }
+
+    fn step(&mut self, current_a: f64) -> f64 {
+        let branch = BranchAt::new(self.model, 0, &self.model.grid_position(self.soc, 0.0), 1.0);
+        self.branch_v = branch.voltage_after(Discretisation::Exact, self.branch_v, current_a, 0.1);
+        self.soc = soc_after(self.soc, 0.1 * current_a, 2.0);
+        self.voltage_v(current_a)
+    }
+}
+
+fn near(found: f64, expected: f64, share: f64) {
+    assert!((found - expected).abs() <= share * expected.abs(), "{found}, expected {expected}");
+}
+
+#[test]
+fn remaining_energy_and_time_agree_with_simulated_discharge() {
+    let model = CellModel { voltage_min_v: 3.2, ..small_model() };
+    for (start, current_a) in [(1.0, 1.0), (0.6, 2.0)] {
+        let outlook = of_one(cell(&model, start), (Mode::Discharge, current_a));
+        let mut circuit = Circuit { model: &model, soc: start, branch_v: 0.0 };
+        let (mut energy_wh, mut seconds) = (0.0, 0.0);
+        loop {
+            let voltage_v = circuit.step(current_a);
+            if voltage_v < 3.2 {
+                break;
+            }
+            (energy_wh, seconds) = (energy_wh + voltage_v * current_a * 0.1 / 3600.0, seconds + 0.1);
+        }
+        near(outlook.remaining_wh.mean, energy_wh, 0.01);
+        near(outlook.to_empty_s.unwrap().mean, seconds, 0.01);
+        assert_eq!(outlook.to_full_s, None);
+    }
+}
+
+#[test]
+fn time_to_full_agrees_with_simulated_charge() {
+    let model = small_model();
+    for (start, current_a) in [(0.2, 1.0), (0.9, 2.0)] {
+        let outlook = of_one(cell(&model, start), (Mode::Charge, -current_a));
+        let mut circuit = Circuit { model: &model, soc: start, branch_v: 0.0 };
+        let (mut held_a, mut energy_wh, mut seconds, mut target_s) = (current_a, 0.0, 0.0, 0.0);
+        while held_a > 0.1 {
+            let voltage_v = circuit.step(-held_a);
+            if voltage_v > 4.2 {
+                held_a -= 0.2 * (voltage_v - 4.2) / 0.06;
+            }
+            (energy_wh, seconds) = (energy_wh + voltage_v * held_a * 0.1 / 3600.0, seconds + 0.1);
+            if circuit.soc < 0.8 {
+                target_s = seconds;
+            }
+        }
+        near(outlook.to_full_s.unwrap().mean, seconds, 0.03);
+        near(outlook.to_full_wh.mean, energy_wh, 0.02);
+        near(outlook.to_target_s.unwrap().mean, target_s, 0.03);
+        assert_eq!(outlook.to_empty_s, None);
+    }
+}
+
+#[test]
+fn power_reaches_limit_of_voltage_or_current() {
+    let model = small_model();
+    let outlook = of_one(cell(&model, 0.5), (Mode::Rest, 0.0));
+    for (k, for_s) in POWER_S.into_iter().enumerate() {
+        for (sign, power, limit_v) in [(1.0, outlook.discharge_w[k], 2.7), (-1.0, outlook.charge_w[k], 4.2)] {
+            let mut circuit = Circuit { model: &model, soc: 0.5, branch_v: 0.0 };
+            let steps = (0..(10.0 * for_s) as u32).map(|_| circuit.step(sign * power.mean / limit_v));
+            near(steps.last().unwrap(), limit_v, 0.005);
+        }
+    }
+    let limited = OutlookConfig { max_discharge_a: Some(2.0), max_charge_a: Some(1.0), ..CONFIG };
+    let cell = of_cell(&limited, &RecentLoad::default(), &cell(&model, 0.5));
+    let drop = |current_a: f64| {
+        let mut circuit = Circuit { model: &model, soc: 0.5, branch_v: 0.0 };
+        (0..100).map(|_| circuit.step(current_a)).last().unwrap()
+    };
+    near(cell.discharge_w.mean, 2.0 * drop(2.0), 0.001);
+    near(cell.charge_w.mean, drop(-1.0), 0.001);
+}
+
+#[test]
+fn weakest_and_fullest_cell_limit_pack() {
+    let model = small_model();
+    let mut cells = [cell(&model, 0.5); 4];
+    (cells[1].soc.mean, cells[2].soc.mean, cells[3].log_resistance.mean) = (0.2, 0.9, 0.5);
+    let pack = Structure { series_per_state: 1.0, strings: 2.0, soc: 0.5, capacity_ah: 0.6 };
+    let outlook = of_pack(&CONFIG, (&loaded(Mode::Charge, -0.5), Mode::Charge), &cells, &pack).unwrap();
+    let one = of_one(cells[2], (Mode::Charge, -0.5));
+    assert_eq!(outlook.to_full_s, one.to_full_s);
+    assert_eq!(outlook.limiting_cells, [CellIndex(3), CellIndex(2)]);
+    // 0.4 Ah from four cells at about 3.0 + 1.2 SOC, in two strings.
+    near(outlook.remaining_wh.mean, 2.0 * 0.4 * (3.48 + 3.12 + 3.96 + 3.48 - 4.0 * 0.04), 0.03);
+}
+
+#[test]
+fn variance_agrees_with_changed_states() {
+    let model = CellModel { voltage_min_v: 3.2, ..small_model() };
+    let spread = CellState {
+        soc: ScalarGaussian::from_std(0.6, 0.02),
+        capacity: ScalarGaussian::from_std(2.0, 0.05),
+        log_resistance: ScalarGaussian::from_std(0.0, 0.1),
+        ..cell(&model, 0.6)
+    };
+    let (load, config) = (Load { mean_a: 1.0, mean_square_a2: 2.0, peak_a: 3.0 }, &CONFIG);
+    let numeric = spread.spread(|cell| cell.remaining(&load, config)[1].mean);
+    let by_load = CellState { log_resistance: ScalarGaussian::from_std(0.0, LOG_LOAD_STD), ..cell(&model, 0.6) };
+    let by_load = by_load.spread(|cell| cell.remaining(&load, config)[1].mean).variance;
+    near(spread.remaining(&load, config)[1].variance, numeric.variance + by_load, 0.1);
+    for direction in [Direction::Discharge, Direction::Charge] {
+        let numeric = spread.spread(|cell| cell.limit_a(direction, 10.0, config).mean);
+        near(spread.limit_a(direction, 10.0, config).variance, numeric.variance, 0.15);
+    }
+}
+
+#[test]
+fn recent_load_contains_changing_current_without_mode() {
+    let mut load = RecentLoad::default();
+    for second in 0..600 {
+        let current_a = if second % 2 == 0 { 5.0 } else { -3.0 };
+        load.observe(Timestamp::from_secs(f64::from(second)), Mode::Unknown, Some(current_a), 0.05);
+    }
+    let found = load.discharge.load().unwrap();
+    near(found.mean_a, 1.0, 0.02);
+    near(found.mean_square_a2, 17.0, 0.02);
+    assert!(found.peak_a > 4.9);
+    // Rest is no load, and a gap is not averaged.
+    load.observe(Timestamp::from_secs(5000.0), Mode::Rest, Some(0.01), 0.05);
+    load.observe(Timestamp::from_secs(5001.0), Mode::Rest, Some(0.01), 0.05);
+    assert_eq!(load.discharge.load(), Some(found));
+    assert_eq!(load.charger_a(Mode::Charge), None);
+}
+
+#[test]
+fn outlook_at_limits_of_state_is_finite() {
+    let model = small_model();
+    for soc in [0.0, 1e-9, 0.5, 1.0] {
+        for log_ratio in [-20.0, 0.0, 8.0] {
+            let mut state = cell(&model, soc);
+            (state.log_resistance.mean, state.soc.variance) = (log_ratio, 0.1);
+            for mode in [(Mode::Charge, -1.0), (Mode::Discharge, 1.0), (Mode::Rest, 0.0)] {
+                let outlook = of_one(state, mode);
+                let times = [outlook.to_empty_s, outlook.to_full_s, outlook.to_target_s].into_iter().flatten();
+                let values = times.chain([outlook.remaining_wh, outlook.to_full_wh]);
+                for value in values.chain(outlook.discharge_w).chain(outlook.charge_w) {
+                    assert!(value.mean >= 0.0 && value.mean.is_finite() && value.variance >= 0.0, "{value:?}");
+                }
+            }
+        }
+    }
+}
