@@ -24,6 +24,10 @@ use crate::quantity::{CellIndex, InvalidState, Mode, Timestamp};
 pub const POWER_S: [f64; 3] = [2.0, 10.0, 30.0];
 /// Time over which the load of a discharge is averaged (s). Over half an hour, fast and slow parts of a drive mix.
 const LOAD_S: f64 = 1800.0;
+/// A charge of at least this time counts (s). Braking ends sooner.
+const LEAST_CHARGE_S: f64 = 600.0;
+/// A charge tapers off when its current has fallen to this share of its strongest current.
+const TAPERED: f64 = 0.8;
 /// Standard deviation of ln(future load over recent load): a driver needs a third more or less in the next half hour.
 const LOG_LOAD_STD: f64 = 0.3;
 /// Time over which the current of a charge is averaged (s). A charger regulates its current. A longer gap without a
@@ -51,10 +55,17 @@ pub struct OutlookConfig {
     pub max_discharge_a: Option<f64>,
     /// Largest current of a charge (A); `None` = only the voltages limit it.
     pub max_charge_a: Option<f64>,
-    /// A charge is complete when its current has fallen to this value (A).
-    pub taper_current_a: f64,
+    /// A charge is complete when its current has fallen to this value (A); `None` = as at the end of the last charge that
+    /// tapered off, before it C/20.
+    pub taper_current_a: Option<f64>,
     /// SOC for which the time of a charge is stated, fraction.
     pub target_soc: f64,
+}
+
+impl OutlookConfig {
+    fn taper_a(&self) -> f64 {
+        self.taper_current_a.unwrap_or(f64::MIN_POSITIVE)
+    }
 }
 
 /// Averages of the current while the pack is discharged, and while it is charged.
@@ -64,6 +75,12 @@ pub struct RecentLoad {
     latest: Option<Timestamp>,
     discharge: Average,
     charge: Average,
+    /// Time and largest mean current of the charge in progress.
+    charging_s: f64,
+    strongest_a: f64,
+    /// Highest voltage of a cell while a charge tapers off, and mean current at its end.
+    held_v: Option<f64>,
+    end_a: Option<f64>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
@@ -105,11 +122,40 @@ impl RecentLoad {
         self.latest = Some(now);
         let Some(current_a) = current_a.filter(|_| seconds > 0.0 && seconds <= CHARGER_S) else { return };
         match mode {
-            Mode::Charge => self.charge.add(-current_a, seconds, CHARGER_S),
-            Mode::Rest if current_a.abs() <= rest_a => self.charge = Average::default(),
+            Mode::Charge => {
+                self.charge.add(-current_a, seconds, CHARGER_S);
+                self.charging_s += seconds;
+                self.strongest_a = self.strongest_a.max(self.charge.mean_a);
+            }
+            Mode::Rest if current_a.abs() <= rest_a => self.end_charge(),
             // A load that changes its direction within seconds has no mode, but is a load.
             Mode::Discharge | Mode::Rest | Mode::Unknown => self.discharge.add(current_a, seconds, LOAD_S),
         }
+    }
+
+    /// Whether the charger reduces its current. Braking ends sooner.
+    pub fn is_tapering(&self, mode: Mode) -> bool {
+        mode == Mode::Charge && self.charging_s >= LEAST_CHARGE_S && self.charge.mean_a < TAPERED * self.strongest_a
+    }
+
+    /// Notes the highest voltage of a cell (V) while the charger reduces its current.
+    pub fn note_held(&mut self, highest_v: f64) {
+        let held_v = self.held_v.unwrap_or(highest_v);
+        self.held_v = Some(held_v + 0.1 * (highest_v - held_v));
+    }
+
+    fn end_charge(&mut self) {
+        if self.is_tapering(Mode::Charge) {
+            self.end_a = Some(self.charge.mean_a);
+        }
+        (self.charge, self.charging_s, self.strongest_a) = (Average::default(), 0.0, 0.0);
+    }
+
+    /// The limits, with what the last charge has shown in place of keys that are not set.
+    fn learned(&self, config: &OutlookConfig, rated_ah: f64) -> OutlookConfig {
+        let taper_a = config.taper_current_a.or(self.end_a).unwrap_or(rated_ah / 20.0);
+        let max_voltage_v = config.max_voltage_v.or(self.held_v);
+        OutlookConfig { max_voltage_v, taper_current_a: Some(taper_a), ..*config }
     }
 
     /// The charger's current (A, positive), if the pack is being charged.
@@ -131,7 +177,9 @@ impl RecentLoad {
             InvalidState::unless_natural("the time of an averaged current", average.seconds)?;
             InvalidState::unless_natural("the mean square of a current", average.mean_square_a2)?;
             InvalidState::unless_numbers("a mean or largest current", [average.mean_a, average.peak_a])
-        })
+        })?;
+        let learned = [self.held_v, self.end_a].into_iter().flatten();
+        InvalidState::unless_naturals("a value of a charge", learned.chain([self.charging_s, self.strongest_a]))
     }
 }
 
@@ -213,8 +261,7 @@ impl CellState<'_> {
 
     /// Voltage (V) at a load: the mean, and the lowest at the largest current.
     fn loaded_v(&self, soc: f64, load: &Load) -> (f64, f64) {
-        let (ocv_v, settled_ohm, fast_ohm) =
-            (self.ocv_v(soc), self.ohm(soc, f64::INFINITY), self.ohm(soc, POWER_S[1]));
+        let (ocv_v, settled_ohm, fast_ohm) = (self.ocv_v(soc), self.ohm(soc, f64::INFINITY), self.ohm(soc, POWER_S[1]));
         (ocv_v - load.loss_v(settled_ohm, fast_ohm), ocv_v - load.peak_v(settled_ohm, fast_ohm))
     }
 
@@ -262,8 +309,8 @@ impl CellState<'_> {
     /// Charge (Ah) that the cell takes up until it is full: until the taper current keeps it at its highest voltage.
     fn chargeable_ah(&self, config: &OutlookConfig) -> f64 {
         let soc = self.soc.mean;
-        let (full, _) = bisect((soc.min(1.0), 1.0), HALVINGS, |soc| self.held_a(soc, config) > config.taper_current_a);
-        let full = if self.held_a(1.0, config) > config.taper_current_a { 1.0 } else { full };
+        let (full, _) = bisect((soc.min(1.0), 1.0), HALVINGS, |soc| self.held_a(soc, config) > config.taper_a());
+        let full = if self.held_a(1.0, config) > config.taper_a() { 1.0 } else { full };
         self.capacity.mean * (full - soc).max(0.0)
     }
 
@@ -295,7 +342,7 @@ impl CellState<'_> {
         let step_ah = charge_ah / f64::from(CHARGE_STEPS);
         (0..CHARGE_STEPS).fold(0.0, |sum_s, step| {
             let soc = self.soc.mean + (f64::from(step) + 0.5) * step_ah / self.capacity.mean;
-            let held_a = self.held_a(soc, config).max(config.taper_current_a);
+            let held_a = self.held_a(soc, config).max(config.taper_a());
             sum_s + 3600.0 * step_ah / current_a.min(held_a)
         })
     }
@@ -427,6 +474,7 @@ pub fn of_pack(
     pack: &Structure,
 ) -> Option<Outlook> {
     let rated_ah = cells.first()?.model.rated_capacity_ah;
+    let config = &load.learned(config, rated_ah);
     let discharge = load.discharge.load();
     let drawn = discharge.unwrap_or(Load::usual(rated_ah));
     let charger_a = load.charger_a(mode).unwrap_or(USUAL_LOAD_PER_H * rated_ah);
@@ -485,6 +533,7 @@ pub fn of_pack(
 /// Computes the outlook of one cell, regardless of the other cells.
 pub fn of_cell(config: &OutlookConfig, load: &RecentLoad, cell: &CellState<'_>) -> CellOutlook {
     let drawn = load.discharge.load().unwrap_or(Load::usual(cell.model.rated_capacity_ah));
+    let config = &load.learned(config, cell.model.rated_capacity_ah);
     let power = |direction| {
         let limit = cell.limit_a(direction, POWER_S[1], config);
         let voltage_v = cell.voltage_after(direction, limit.mean, POWER_S[1]);

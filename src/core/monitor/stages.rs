@@ -225,7 +225,13 @@ impl Stages {
         let observed = state.detector.observe(&config.transition, now, current_a);
         let strings = self.sampling.sampler.strings();
         let rest_a = config.transition.dead_band_a / strings;
-        state.load.observe(now, state.detector.mode(), current_a.map(|pack_a| pack_a / strings), rest_a);
+        let mode = state.detector.mode();
+        state.load.observe(now, mode, current_a.map(|pack_a| pack_a / strings), rest_a);
+        if state.load.is_tapering(mode)
+            && let Some(highest_v) = self.sampling.sampler.highest_voltage_v(now)
+        {
+            state.load.note_held(highest_v);
+        }
         if observed.change.is_none() && !observed.candidate_begins {
             return;
         }
