@@ -261,8 +261,9 @@ impl CellState<'_> {
 
     /// Voltage (V) at a load: the mean, and the lowest at the largest current.
     fn loaded_v(&self, soc: f64, load: &Load) -> (f64, f64) {
-        let (ocv_v, settled_ohm, fast_ohm) = (self.ocv_v(soc), self.ohm(soc, f64::INFINITY), self.ohm(soc, POWER_S[1]));
-        (ocv_v - load.loss_v(settled_ohm, fast_ohm), ocv_v - load.peak_v(settled_ohm, fast_ohm))
+        let (ocv_v, settled_ohm) = (self.ocv_v(soc), self.ohm(soc, f64::INFINITY));
+        let [peak_ohm, fast_ohm, _] = POWER_S.map(|after_s| self.ohm(soc, after_s));
+        (ocv_v - load.loss_v(settled_ohm, fast_ohm), ocv_v - load.peak_v(settled_ohm, peak_ohm))
     }
 
     /// SOC at which the voltage at the largest current of the load falls to the lowest voltage.
