@@ -7,7 +7,7 @@ use crate::cli::common::alarms::{AlarmGroup, grouped};
 use crate::cli::common::output;
 use crate::io::stamp;
 use crate::monitor::{CellView, ModelState, PackView};
-use crate::quantity::catalogue::{PackValues, Quantity};
+use crate::quantity::catalogue::{Estimate, PackValues, Quantity};
 use crate::status::counters::LATENCY_BOUNDS_S;
 use crate::status::document::{Intruder, IntruderKind, StatusDocument};
 
@@ -79,6 +79,13 @@ fn pack(text: &mut String, document: &StatusDocument) {
         mean(&pack.values, Quantity::Current, 2),
         mean(&pack.values, Quantity::TemperatureMax, 1),
     );
+    let _ = writeln!(text, "energy     {}", energy(&pack.values));
+    if pack.values.get(Quantity::DischargePower10s).is_some() {
+        let [discharge, charge] = [Quantity::DischargePower10s, Quantity::ChargePower10s];
+        let (discharge, charge) = (with_std(&pack.values, discharge, 1), with_std(&pack.values, charge, 1));
+        let [drawn, charged] = [0, 1].map(|k| in_brackets(pack.power_limiting_cells.map(|cells| cells[k])));
+        let _ = writeln!(text, "power      for 10 s: discharge {discharge}{drawn}, charge {charge}{charged}");
+    }
     let _ = writeln!(
         text,
         "health     capacity {}{}, SOH {}, usable {}, recharge period {}, with the reference charger {}",
@@ -99,6 +106,24 @@ fn pack(text: &mut String, document: &StatusDocument) {
     }
     let _ = writeln!(text, "losses     {}", losses(&pack.values));
     let _ = writeln!(text, "life       {}", remaining(pack));
+}
+
+/// Describes the energy of the pack, and the time until it is empty or full.
+fn energy(values: &PackValues) -> String {
+    let mut text = format!(
+        "remaining {}, to full {}",
+        with_std(values, Quantity::RemainingEnergy, 2),
+        with_std(values, Quantity::EnergyToFull, 2),
+    );
+    for (what, quantity) in
+        [("empty", Quantity::TimeToEmpty), ("full", Quantity::TimeToFull), ("the target", Quantity::TimeToTarget)]
+    {
+        if let Some(Estimate { mean, std }) = values.get(quantity) {
+            let std = std.map_or_else(String::new, |std| format!(" ± {}", duration(std)));
+            let _ = write!(text, ", {}{std} to {what}", duration(mean));
+        }
+    }
+    text
 }
 
 /// Describes the lost lithium and active material of the weakest cell.

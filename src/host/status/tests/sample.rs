@@ -140,6 +140,9 @@ fn pack(cells: u16) -> PackView {
         (Quantity::Soh, 0.928, Some(0.008)),
         (Quantity::UsableCapacity, 2.31, Some(0.04)),
         (Quantity::NormalisedRechargePeriod, 5432.0, Some(61.0)),
+        (Quantity::RemainingEnergy, 541.0, Some(23.0)),
+        (Quantity::TimeToEmpty, 4321.0, Some(600.0)),
+        (Quantity::DischargePower10s, 8210.0, Some(410.0)),
     ] {
         values.set(quantity, Some(Estimate { mean, std }));
     }
@@ -151,6 +154,7 @@ fn pack(cells: u16) -> PackView {
         limiting_cell: Some(CellIndex(0)),
         weakest_cell: Some(CellIndex(0)),
         shortest_lived_cell: Some(CellIndex(0)),
+        power_limiting_cells: Some([CellIndex(0), CellIndex(0)]),
         values: with_life(values, 0.061, 412.3),
     }
 }
