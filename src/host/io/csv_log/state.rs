@@ -12,20 +12,32 @@ pub(super) enum Direction {
 }
 
 /// Parts of words for a discharge, without accents.
-const DISCHARGE: &str = "disch dsch dch dsg dech entlad ontlad utlad urlad aflad descarg scaric rozlad \
+const DISCHARGE: &str = "disch dsg entlad ontlad utlad urlad aflad descarg scaric rozlad \
     \u{440}\u{430}\u{437}\u{440}\u{44f}\u{434} \u{653e}\u{7535} \u{653e}\u{96fb}";
+/// Beginnings of words for a discharge. Elsewhere they may be of two words: `gridcharging`.
+const DISCHARGE_START: [&str; 3] = ["dch", "dsch", "dech"];
 /// Parts of words for a charge.
 const CHARGE: &str = "charg chrg chg regen lade ladu ladd ladn ladi ladow carga caric \
     \u{437}\u{430}\u{440}\u{44f}\u{434} \u{5145}\u{7535} \u{5145}\u{96fb}";
 /// Words for no current.
-const REST: &str = "r p s o rest resting pau pause pse idle standby ocv ocp wait waiting ruhe relax repos stop stopped open off end ready \
+const REST: &str = "r p s o rest resting pau pause pse idle stand standby ocv ocp wait waiting ruhe relax repos stop stopped open off end ready \
     full float finished none \u{9759}\u{7f6e} \u{6401}\u{7f6e} \u{4f11}\u{6b62}";
 /// Words that negate the others.
 const NEGATION: &str = "not no non nicht kein keine without";
 
 /// The words of a state in lower case, without accents.
 fn words(state: &[u8]) -> Vec<String> {
-    let text = String::from_utf8_lossy(state).to_lowercase().replace("notch", "not ch").replace("notd", "not d");
+    let mut text = String::new();
+    let (state, mut last) = (String::from_utf8_lossy(state), ' ');
+    let mut chars = state.chars().peekable();
+    while let Some(c) = chars.next() {
+        if last.is_lowercase() && c.is_uppercase() && chars.peek().is_some_and(|next| next.is_alphabetic()) {
+            text.push(' ');
+        }
+        text.push(c);
+        last = c;
+    }
+    let text = text.to_lowercase().replace("notch", "not ch").replace("notd", "not d");
     let plain = text.chars().map(|c| match c {
         '\u{e8}'..='\u{eb}' => 'e',
         '\u{e0}'..='\u{e5}' => 'a',
@@ -49,9 +61,14 @@ pub(super) fn direction(state: &[u8]) -> Option<Direction> {
     let is = |list: &str| words.iter().any(|word| list.split(' ').any(|of| of == word));
     let has = |parts: &str| words.iter().any(|word| parts.split(' ').any(|part| word.contains(part)));
     let is_divided = words.windows(2).any(|pair| ["d", "dis", "de"].contains(&&*pair[0]) && pair[1].starts_with("ch"));
+    // `CC`, `CV`, `CP` and `CR` may precede the word.
+    let bare = |word: &String| word.trim_start_matches(|c: char| c.is_ascii_digit() || "cvpr".contains(c)).to_owned();
+    let is_begun = words.iter().map(bare).any(|word| DISCHARGE_START.iter().any(|start| word.starts_with(start)));
     match () {
         () if is(NEGATION) => None,
-        () if is("d dis ent") || is_divided || has(DISCHARGE) => Some(Direction::Discharge),
+        () if is("d dis ent") || is_divided || is_begun || has(DISCHARGE) => Some(Direction::Discharge),
+        // `PULSEDCHG` and `GRIDCHG` cannot be told apart.
+        () if has("dchg dchrg") => None,
         () if is("c ch cha lad") || has(CHARGE) => Some(Direction::Charge),
         () => None,
     }
@@ -149,12 +166,15 @@ mod tests {
             }
         };
         all(
-            "DISCH,DSG,Dischrg,D\u{e9}charge,Entladen,DIS-CHG,CCDChg,D_CC,Dis Charge,descarga,dsch",
+            "DISCH,DSG,Dischrg,D\u{e9}charge,Entladen,DIS-CHG,CCDChg,D_CC,Dis Charge,descarga,dsch,PulseDChg,CCCVDCHG,DisCharge",
             Some(Direction::Discharge),
         );
-        all("CHG,Chrg,Charge,Laden,C_CC,Mid-charge,2nd charge,Regen,Carga,CC-CV Cha", Some(Direction::Charge));
-        all("Not charging,NotCharging,No discharge,Idle,Unknown,OK,1,change,Channel", None);
-        assert!(["Not charging", "Rest", "PAU", "Idle", "R"].iter().all(|text| is_rest(text.as_bytes())));
+        all(
+            "GridCharging,ScheduledCharging,TimedCharge,gridcharging,ModeCharging,CHG,Chrg,Charge,Laden,C_CC,Mid-charge,2nd charge,Regen,Carga,CC-CV Cha",
+            Some(Direction::Charge),
+        );
+        all("PULSEDCHG,SoC,Not charging,NotCharging,No discharge,Idle,Unknown,OK,1,change,Channel", None);
+        assert!(["Not charging", "StandBy", "Rest", "PAU", "Idle", "R"].iter().all(|text| is_rest(text.as_bytes())));
         assert!(["CC", "Driving", "1", ""].iter().all(|text| !is_rest(text.as_bytes())));
     }
 }
