@@ -281,19 +281,24 @@ impl Judge<'_> {
     fn unstated_time_unit(&self, layout: &Layout) -> (&'static Unit, bool) {
         let raw = &self.samples.raw_times;
         let find = |symbol: &str| Unit::find(symbol).unwrap_or(layout.time.unit);
-        let first = raw.iter().copied().find(|time| time.is_finite());
-        if let Some(unit) = first.and_then(plausible::probable_stamp_unit) {
+        let middle = median(raw);
+        if let Some(unit) = middle.and_then(plausible::probable_stamp_unit) {
             return (find(unit), false);
         }
-        let (Some(first), true) = (first, raw.len() > 2) else { return (layout.time.unit, true) };
-        if first > 1e8 {
+        let (Some(middle), true) = (middle, raw.len() > 2) else { return (layout.time.unit, true) };
+        if middle > 1e8 {
             // Seconds since 1970.
             return (layout.time.unit, false);
         }
-        let step = plausible::median_step(raw).unwrap_or_default();
+        // Several rows may have the same time in whole seconds.
+        let mut distinct = raw.clone();
+        distinct.dedup();
+        let step = plausible::median_step(&distinct).unwrap_or_default();
+        let days = find("Excel days");
         // From 1970 to 2100, with rows at most some minutes apart; as seconds, they would be less than 4 ms apart.
-        if (25_569.0..73_051.0).contains(&first) && step < 0.004 {
-            return (find("Excel days"), true);
+        if (25_569.0..73_051.0).contains(&middle) && step > 0.0 && step < 0.004 && self.is_possible_time_unit(raw, days)
+        {
+            return (days, true);
         }
         let by_charge = ["s", "min", "h", "ms", "us"]
             .into_iter()
@@ -428,7 +433,7 @@ impl Judge<'_> {
         };
         let [discharges, charges] = [Direction::Discharge, Direction::Charge].map(|direction| count(direction, true));
         // With charges and discharges of a positive current, single negative currents are faults of a magnitude.
-        let is_magnitude = charges > 0 && discharges > 0 && 100 * negative <= samples.currents.len();
+        let is_magnitude = negative < charges.min(discharges) && 100 * negative <= samples.currents.len();
         let is_never_negative = negative == 0 || is_magnitude;
         let codes = if is_never_negative { self.codes(layout, times) } else { Vec::new() };
         if is_never_negative && discharges + charges + codes.len() > 0 {

@@ -75,6 +75,28 @@ fn one_sided_beginning_does_not_decide_magnitude() {
 }
 
 #[test]
+fn late_state_does_not_make_signed_current_a_magnitude() {
+    let charge: String = (0..10_000).map(|n| format!("{n},1.0,3.9,CC Chg\n")).collect();
+    let discharge: String = (0..80).map(|n| format!("{},-5.0,3.7,CC DChg\n", 10_001 + n)).collect();
+    let text = format!("Time (s),Current (A),Voltage (V),State\n{charge}10000,1.0,3.9,CC DChg\n{discharge}");
+    let mut log = open(&text).expect("opens");
+    while log.next_row().expect("reads").is_some() {}
+    assert_eq!((log.reading().accepted(), log.values[0].1), (10_081, Some(5.0)), "{}", log.reading());
+}
+
+#[test]
+fn whole_seconds_in_the_range_of_dates_are_seconds() {
+    for (divide, per_row, expected) in
+        [(4, 1.0, "in s"), (1, 1.0 / 86_400.0, "in Excel days"), (4, 1e-5, "in Excel days")]
+    {
+        let row = |n: u32| format!("{},1,3.7\n", 45_000.0 + f64::from(n / divide) * per_row);
+        let text = format!("Time,Current (A),Voltage (V)\n{}", (0..100).map(row).collect::<String>());
+        let said = open(&text).expect("opens").reading().to_string();
+        assert!(said.contains(expected), "{said}");
+    }
+}
+
+#[test]
 fn magnitude_in_unknown_state_is_refused_by_name() {
     let mut log = open("Time (s),Current (A),Voltage (V),State\n0,1,3.9,C\n1,2,3.7,D\n2,2,3.7,Boost\n3,0,3.7,Boost\n")
         .expect("opens");
