@@ -119,7 +119,13 @@ impl Judge<'_> {
         if layout.section.is_none() {
             let size = PackSize { capacity_ah: self.options.capacity_ah };
             let response = plausible::check_response(&times, &currents, &self.samples.voltages, size);
-            response.map_err(|of| self.fault(layout, &of))?;
+            response.map_err(|mut of| {
+                if of.quantity == "time" {
+                    of.probable =
+                        (time_form == TimeForm::Number).then(|| self.other_time_unit(time.unit, false)).flatten();
+                }
+                self.fault(layout, &of)
+            })?;
         }
         self.compare_charge(layout, &times, &currents)?;
         Ok(Judgement { time, time_form, is_time_assumed, sign, notes: self.notes })
@@ -258,8 +264,8 @@ impl Judge<'_> {
         if layout.section.is_none() {
             plausible::check_order(&times).map_err(|of| self.fault(layout, &of))?;
         }
-        if form == TimeForm::Number && layout.time.is_stated && unit.per_base() == 1.0 {
-            self.note_other_unit(layout, &times);
+        if form == TimeForm::Number && layout.time.is_stated {
+            self.note_other_unit(layout, unit, &times);
         }
         Ok((reader, form, is_assumed, times))
     }
@@ -344,20 +350,42 @@ impl Judge<'_> {
         (charge > 0.0 && stated > 0.0).then(|| charge / stated)
     }
 
-    /// Notes times that are stated in seconds but advance as minutes or hours do, or are too short for the voltages.
-    fn note_other_unit(&mut self, layout: &Layout, times: &[f64]) {
-        let name = &self.header.names()[layout.time.index];
-        let Samples { currents, voltages, .. } = &self.samples;
-        let slope = self.options.capacity_ah.map(|ah| plausible::check_slope(times, currents, voltages, ah));
-        let grid = grid_unit(times)
-            .filter(|unit| self.is_possible_time_unit(times, Unit::find(unit).unwrap_or(layout.time.unit)));
-        let (what, unit) = match (slope, grid) {
-            (Some(Err(of)), grid) => (of.what, grid.or(of.probable).unwrap_or("min")),
-            (_, Some(unit)) => (format!("advances like {unit}"), unit),
-            _ => return,
+    /// The unit closest to `unit`, longer or shorter, that the table allows with rows at least 20 ms apart.
+    fn other_time_unit(&self, unit: &Unit, is_longer: bool) -> Option<&'static str> {
+        let raw = &self.samples.raw_times;
+        let step = plausible::median_step(raw).unwrap_or_default();
+        let is_possible = |symbol: &&str| {
+            let other = Unit::find(symbol).unwrap_or(unit);
+            let ratio = unit.per_base() / other.per_base();
+            (if is_longer { ratio > 1.0 } else { ratio < 1.0 })
+                && other.convert(step) >= 0.02
+                && self.is_possible_time_unit(raw, other)
         };
+        let units = ["ns", "us", "ms", "s", "min", "h"];
+        if is_longer { units.into_iter().find(is_possible) } else { units.into_iter().rev().find(is_possible) }
+    }
+
+    /// Notes times that advance as those of a longer unit than the stated one do, or are too short for the voltages.
+    fn note_other_unit(&mut self, layout: &Layout, stated: &Unit, times: &[f64]) {
+        let Samples { currents, voltages, .. } = &self.samples;
+        let slope = self.options.capacity_ah.and_then(|ah| plausible::check_slope(times, currents, voltages, ah).err());
+        let raw = &self.samples.raw_times;
+        let grid = grid_unit(raw).filter(|unit| {
+            let unit = Unit::find(unit).unwrap_or(stated);
+            unit.per_base() < stated.per_base() && self.is_possible_time_unit(raw, unit)
+        });
+        let step_s = plausible::median_step(times).unwrap_or_default();
+        let is_short = stated.per_base() > 1.0 && step_s < 0.1 && self.options.capacity_ah.is_some();
+        let longer = || self.other_time_unit(stated, true);
+        let (what, unit) = match (slope, grid) {
+            (Some(of), grid) => (of.what, grid.or_else(longer).or(of.probable)),
+            (_, Some(unit)) => (format!("advances like {unit}"), Some(unit)),
+            _ => (format!("advances by {step_s} s per row"), longer().filter(|_| is_short)),
+        };
+        let (name, Some(unit)) = (&self.header.names()[layout.time.index], unit) else { return };
         self.notes.push(format!(
-            "column {name} {what}, but is read in s; if it is in {unit}, use --column time='{name}[{unit}]'"
+            "column {name} {what}, but is read in {}; if it is in {unit}, use --column time='{name}[{unit}]'",
+            stated.symbol
         ));
     }
 

@@ -85,6 +85,42 @@ fn late_state_does_not_make_signed_current_a_magnitude() {
 }
 
 #[test]
+fn other_unit_of_time_must_be_possible() {
+    let options = CsvOptions { cells: 1, series: 1, capacity_ah: Some(2.6), ..CsvOptions::default() };
+    // Loads, rests and charges of 20 minutes each; the voltage changes by less than 0.2 V in each.
+    let sample = |n: u32| {
+        let current_a = [1.3, 0.0, -1.0][n as usize / 120 % 3];
+        (10.0 * f64::from(n), current_a, 3.8 - 0.001 * f64::from(n % 120) * current_a - 0.05 * current_a)
+    };
+    let read = |unit: &str, per_s: f64, strings: f64| {
+        let row = |(time_s, current_a, voltage_v): (f64, f64, f64)| {
+            format!("{},{},{voltage_v}\n", time_s * per_s, strings * current_a)
+        };
+        let text = format!("time_{unit},current_a,voltage_v\n{}", (0..720).map(|n| row(sample(n))).collect::<String>());
+        let log = CsvLog::open(Box::new(std::io::Cursor::new(text)), Path::new("cell.csv"), &options);
+        log.map_or_else(|error| error.to_string(), |log| log.reading().to_string())
+    };
+    for (stated, per_s, expected) in [
+        ("ms", 1.0, "if it is in s, use"),
+        ("us", 1.0, "if it is in s, use"),
+        ("min", 1.0, "probably s:"),
+        ("min", 1.0 / 3600.0, "if it is in h, use"),
+        ("s", 1000.0, "probably ms:"),
+    ] {
+        let said = read(stated, per_s, 1.0);
+        assert!(said.contains(expected), "{stated}: {said}");
+    }
+    assert!(
+        ["s", "ms"]
+            .map(|unit| read(unit, if unit == "s" { 1.0 } else { 1e3 }, 1.0))
+            .iter()
+            .all(|said| !said.contains("--column"))
+    );
+    let many = read("s", 1.0, 40.0);
+    assert!(many.contains("all parallel cells") && !many.contains("probably"), "{many}");
+}
+
+#[test]
 fn whole_seconds_in_the_range_of_dates_are_seconds() {
     for (divide, per_row, expected) in
         [(4, 1.0, "in s"), (1, 1.0 / 86_400.0, "in Excel days"), (4, 1e-5, "in Excel days")]
