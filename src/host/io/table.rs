@@ -403,7 +403,7 @@ impl<'t> Row<'t> {
     /// # Errors
     /// Fails if the field is neither a finite number nor empty.
     pub fn number(&self, column: usize) -> Result<Option<f64>, TableError> {
-        self.number_in(column, f64::MIN..=f64::MAX, "a finite number or an empty field")
+        self.number_in(column, f64::MIN..=f64::MAX, "a finite number, empty, - or n/a")
     }
 
     /// A number in `range`; `None` for an empty field.

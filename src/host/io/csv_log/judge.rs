@@ -21,6 +21,8 @@ pub(super) struct Judgement {
     pub(super) time_form: TimeForm,
     /// Whether the unit of time is a guess.
     pub(super) is_time_assumed: bool,
+    /// Whether the first time is after the times that follow, which are in order.
+    pub(super) is_first_time_late: bool,
     pub(super) sign: CurrentSign,
     /// Remarks for the user.
     pub(super) notes: Vec<String>,
@@ -128,7 +130,9 @@ impl Judge<'_> {
             })?;
         }
         self.compare_charge(layout, &times, &currents)?;
-        Ok(Judgement { time, time_form, is_time_assumed, sign, notes: self.notes })
+        let next = &times[times.len().min(1)..times.len().min(4)];
+        let is_first_time_late = next.len() > 1 && next.is_sorted() && next.iter().all(|time| *time < times[0]);
+        Ok(Judgement { time, time_form, is_time_assumed, is_first_time_late, sign, notes: self.notes })
     }
 
     /// The error for a column whose values are not in its unit.
@@ -469,9 +473,17 @@ impl Judge<'_> {
             self.notes.extend(codes.iter().map(|(code, direction)| {
                 format!("state {} is a {direction:?} by the voltage", String::from_utf8_lossy(code)).to_lowercase()
             }));
-            let has_positive = [charges > 0 || !codes.is_empty(), discharges > 0 || !codes.is_empty()];
+            let [has_positive_charge, has_positive_discharge] =
+                [charges, discharges].map(|count| count > 0 || !codes.is_empty());
             let by_state = CurrentSign::new(true, SignSource::State);
-            return Ok(CurrentSign { is_by_state: true, has_positive, noise_a, codes, ..by_state });
+            return Ok(CurrentSign {
+                is_by_state: true,
+                has_positive_charge,
+                has_positive_discharge,
+                noise_a,
+                codes,
+                ..by_state
+            });
         }
         let samples = &self.samples;
         let shown = plausible::shown_sign(times, &samples.currents, &samples.voltages);

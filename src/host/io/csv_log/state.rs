@@ -90,9 +90,10 @@ pub(super) struct CurrentSign {
     pub(super) is_charge_positive: bool,
     /// Whether the current is a magnitude whose sign the state column gives.
     pub(super) is_by_state: bool,
-    /// Whether charges and discharges with a positive current have occurred. Both together show a magnitude.
-    pub(super) has_positive: [bool; 2],
-    /// Largest current that counts as none (A).
+    /// Whether a charge with a positive current has occurred. With a discharge of this kind, it shows a magnitude.
+    pub(super) has_positive_charge: bool,
+    pub(super) has_positive_discharge: bool,
+    /// Currents up to this size are noise of a current of zero (A).
     pub(super) noise_a: f64,
     /// Directions of states that are numbers.
     pub(super) codes: Vec<(Vec<u8>, Direction)>,
@@ -101,8 +102,15 @@ pub(super) struct CurrentSign {
 
 impl CurrentSign {
     pub(super) fn new(is_charge_positive: bool, source: SignSource) -> Self {
-        let has_positive = [false; 2];
-        Self { is_charge_positive, is_by_state: false, has_positive, noise_a: 0.0, codes: Vec::new(), source }
+        Self {
+            is_charge_positive,
+            is_by_state: false,
+            has_positive_charge: false,
+            has_positive_discharge: false,
+            noise_a: 0.0,
+            codes: Vec::new(),
+            source,
+        }
     }
 
     /// The direction of a state.
@@ -116,15 +124,17 @@ impl CurrentSign {
             let Some(direction) = direction else { return (value.abs() <= self.noise_a).then_some(value) };
             let is_discharge = direction == Direction::Discharge;
             if value >= -self.noise_a {
-                self.has_positive[usize::from(is_discharge)] |= value > self.noise_a;
+                self.has_positive_charge |= !is_discharge && value > self.noise_a;
+                self.has_positive_discharge |= is_discharge && value > self.noise_a;
                 return Some(if is_discharge { value } else { -value });
             }
-            if self.has_positive == [true; 2] {
+            if self.has_positive_charge && self.has_positive_discharge {
                 return None;
             }
             // The first negative current shows a sign, which the one-sided rows before it could not show.
             self.is_by_state = false;
-            self.is_charge_positive = if is_discharge { !self.has_positive[1] } else { self.has_positive[0] };
+            self.is_charge_positive =
+                if is_discharge { !self.has_positive_discharge } else { self.has_positive_charge };
         }
         let discharge_a = if self.is_charge_positive { -value } else { value };
         // A discharge in the state of a charge contradicts the sign that a single negative current has shown.

@@ -151,13 +151,38 @@ fn voltage_of_pack_is_preferred_for_pack() {
     let text = "Time (s),Current (A),Voltage (V),Pack Voltage (V)\n0,1,12.4,15\n";
     let log = CsvLog::open(Box::new(std::io::Cursor::new(text)), Path::new("x.csv"), &options).expect("opens");
     assert!(log.reading().to_string().contains("\"Pack Voltage (V)\""), "{}", log.reading());
+    let text = "time/s\tEwe/V\tI/mA\tEcell/V\tTemperature (cell)\n0\t3.5\t10\t15\t25\n";
+    let log = CsvLog::open(Box::new(std::io::Cursor::new(text)), Path::new("x.mpt"), &options).expect("opens");
+    let said = log.reading().to_string();
+    assert!(said.contains("\"Ecell/V\"") && said.contains("(cell)") && !said.contains("left out"), "{said}");
+}
+
+#[test]
+fn commented_header_is_of_a_table() {
+    assert!(is_table(Path::new("x.txt"), b"# Time [s]\tCurrent [A]\tVoltage [V]\n0\t1\t3.7\n"));
+    assert!(!is_table(Path::new("x.log"), b"# Time, current, voltage and more\n(1.0) can0 123#00,\n"));
+}
+
+#[test]
+fn late_first_time_costs_its_row_only() {
+    for (times, bad) in [("4e9 1 2 3 4 5", "\"4e9\""), ("10 5 12 13 14 15", "\"5\"")] {
+        let rows: String = times.split(' ').map(|time| format!("{time},1,3.7\n")).collect();
+        let mut log = open(&format!("Time (s),Current (A),Voltage (V)\n{rows}")).expect("opens");
+        let read: Vec<_> = std::iter::from_fn(|| log.next_row().expect("reads")).collect();
+        let faults: Vec<String> = read.into_iter().filter_map(Result::err).map(|error| error.to_string()).collect();
+        assert!(faults.len() == 1 && faults[0].contains(bad), "{faults:?}");
+    }
 }
 
 #[test]
 fn dates_without_a_clear_order_say_it() {
-    for (days, expected) in
-        [(["03-04", "03-04"], "read as month/day"), (["03-04", "04-04"], "read as day/month"), (["13-04", "14-04"], "")]
-    {
+    for (days, expected) in [
+        (vec!["03-04", "03-04"], "read as month/day"),
+        (vec!["03-04", "04-04"], "read as day/month"),
+        (vec!["13-04", "14-04"], ""),
+        (vec!["04-13", "04-14", "31-01"], ""),
+        (vec!["33-04", "03-04", "04-04"], "read as day/month"),
+    ] {
         let rows: String = days.iter().map(|day| format!("{day}-2023 10:00:00,1,3.7\n")).collect();
         let said = open(&format!("Date,Current (A),Voltage (V)\n{rows}")).expect("opens").reading().to_string();
         assert!(said.contains(expected) && said.contains("dates are read") != expected.is_empty(), "{said}");
