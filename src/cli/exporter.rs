@@ -25,6 +25,11 @@ pub(crate) struct Args {
     log: Option<String>,
 }
 
+#[cfg(feature = "lab")]
+const REPORT: exporter::ReportMaker = Some(super::report::page_of_store);
+#[cfg(not(feature = "lab"))]
+const REPORT: exporter::ReportMaker = None;
+
 fn address(text: &str) -> Result<SocketAddr, String> {
     text.parse().map_err(|_| "must be a numeric address and a port, for example 127.0.0.1:9558 or [::]:9558".to_owned())
 }
@@ -40,5 +45,5 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     logging::start(args.log.as_deref()).map_err(Failure::new)?;
     let socket = args.socket.clone().unwrap_or_else(standard_path);
     let token_file = args.token_file.clone().or_else(credential);
-    exporter::run(args.listen, &socket, token_file.as_deref()).map_err(Failure::new)
+    exporter::run(args.listen, &socket, token_file.as_deref(), REPORT).map_err(Failure::new)
 }

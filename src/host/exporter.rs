@@ -5,6 +5,7 @@
 //! * `/metrics`: without a recent status, the answer contains only `packwatch_up 0`. Clients that accept OpenMetrics 1.0
 //!   receive that format; other clients receive Prometheus' text format 0.0.4.
 //! * `/`: the live page; `/events`: its server-sent events; `/-/healthy`: a liveness check.
+//! * `/report`: the report of the daemon's store, if this program can make reports.
 //! * On the address of a network, the page and the events need a token ([`Access`]).
 //! * At most [`MAX_CONNECTIONS`] connections are open, and [`MAX_PER_ADDRESS`] per client address. A further connection
 //!   replaces the one that has been idle longest. If none has been idle for long enough, the further connection is
@@ -23,6 +24,7 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::pin::pin;
 use std::rc::Rc;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use http_body_util::Full;
@@ -37,7 +39,8 @@ use hyper::{Method, Request, Response, StatusCode};
 use hyper_util::rt::{TokioIo, TokioTimer};
 use sd_notify::NotifyState;
 use tokio::net::{TcpListener, TcpStream};
-use tokio::task::{JoinSet, LocalSet};
+use tokio::sync::Semaphore;
+use tokio::task::{JoinSet, LocalSet, spawn_blocking};
 use tokio::time::{sleep, timeout};
 
 use self::access::{Access, Decision};
@@ -72,15 +75,22 @@ const PROMETHEUS_TEXT: &str = "text/plain; version=0.0.4; charset=utf-8";
 const HTML: &str = "text/html; charset=utf-8";
 const PLAIN: &str = "text/plain; charset=utf-8";
 const EVENTS: &str = "text/event-stream";
+const NO_REPORT: &str = "this program makes no reports: run packwatch report --state DIR on a computer\n";
 const NEEDS_TOKEN: &str = "needs the token: open /?token=TOKEN once, or send the header Authorization: Bearer TOKEN\n";
 const ONLY_LOCAL: &str =
     "on an address of a network, the page needs a token: start packwatch exporter with --token-file\n";
+
+/// Makes the report of a store's folder; `None` = this program cannot make reports.
+pub type ReportMaker = Option<fn(&Path) -> Result<String, String>>;
 
 /// What all connections share.
 struct Site {
     live: Rc<Live>,
     access: Access,
     page: String,
+    report: ReportMaker,
+    /// One report is made at a time.
+    report_permit: Arc<Semaphore>,
 }
 
 /// Follows the daemon's status next to `socket` and serves it on the address `listen`, until a signal stops the
@@ -88,11 +98,11 @@ struct Site {
 ///
 /// # Errors
 /// Fails if the token cannot be read, or if the address cannot be bound.
-pub fn run(listen: SocketAddr, socket: &Path, token_file: Option<&Path>) -> Result<(), String> {
+pub fn run(listen: SocketAddr, socket: &Path, token_file: Option<&Path>, report: ReportMaker) -> Result<(), String> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
     let runtime = runtime.map_err(|error| format!("cannot start: {error}"))?;
     let access = Access::new(listen.ip(), token_file)?;
-    let site = Site { live: Rc::default(), access, page: page::template() };
+    let site = Site::new(access, report);
     let served = async { serve(TcpListener::bind(listen).await?, Rc::new(site), socket.to_owned()).await };
     let served = LocalSet::new().block_on(&runtime, served);
     served.map_err(|error| {
@@ -100,6 +110,13 @@ pub fn run(listen: SocketAddr, socket: &Path, token_file: Option<&Path>) -> Resu
             "{listen}: cannot listen there: {error}; give an address of this computer and a free port with --listen"
         )
     })
+}
+
+impl Site {
+    fn new(access: Access, report: ReportMaker) -> Self {
+        let report_permit = Arc::new(Semaphore::new(1));
+        Self { live: Rc::default(), access, page: page::template(report.is_some()), report, report_permit }
+    }
 }
 
 async fn serve(listener: TcpListener, site: Rc<Site>, socket: PathBuf) -> io::Result<()> {
@@ -203,8 +220,9 @@ async fn answer(request: &Request<Incoming>, site: &Site, activity: &Activity, e
             with(answer, REFERRER_POLICY, "no-referrer")
         }
         "/events" => answer_with(StatusCode::OK, EVENTS, site.live.events(activity.clone(), end)),
+        "/report" => report(site).await,
         "/-/healthy" => respond(StatusCode::OK, PLAIN, "healthy\n"),
-        _ => respond(StatusCode::NOT_FOUND, PLAIN, "must be /, /events, /metrics or /-/healthy\n"),
+        _ => respond(StatusCode::NOT_FOUND, PLAIN, "must be /, /events, /report, /metrics or /-/healthy\n"),
     }
 }
 
@@ -225,6 +243,26 @@ fn with(mut answer: Answer, name: HeaderName, value: &str) -> Answer {
         answer.headers_mut().insert(name, value);
     }
     answer
+}
+
+/// Makes the report of the daemon's store.
+async fn report(site: &Site) -> Answer {
+    let Some(make) = site.report else { return respond(StatusCode::NOT_FOUND, PLAIN, NO_REPORT) };
+    let store = site.live.document().await.and_then(|document| document.store);
+    let folder = store.and_then(|store| Some(Path::new(&store.path).parent()?.to_owned()));
+    let Some(folder) = folder else { return respond(StatusCode::NOT_FOUND, PLAIN, "no daemon with a store answers\n") };
+    let Ok(permit) = Arc::clone(&site.report_permit).acquire_owned().await else {
+        return respond(StatusCode::SERVICE_UNAVAILABLE, PLAIN, "the exporter stops\n");
+    };
+    let made = spawn_blocking(move || {
+        let _permit = permit;
+        make(&folder)
+    });
+    match made.await {
+        Ok(Ok(page)) => respond(StatusCode::OK, HTML, page),
+        Ok(Err(error)) => respond(StatusCode::INTERNAL_SERVER_ERROR, PLAIN, error + "\n"),
+        Err(error) => respond(StatusCode::INTERNAL_SERVER_ERROR, PLAIN, format!("no report: {error}\n")),
+    }
 }
 
 async fn metrics(headers: &HeaderMap, live: &Live) -> Answer {

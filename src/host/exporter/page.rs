@@ -17,9 +17,10 @@ const NONCE: &str = "NONCE";
 /// Text in [`PAGE`] that the names and units replace.
 const CATALOGUE: &str = "CATALOGUE";
 
-/// Returns the page with the names and units of all quantities, alarms and findings.
-pub(super) fn template() -> String {
-    PAGE.replacen(CATALOGUE, &catalogue().to_string(), 1)
+/// Returns the page with the names and units of all quantities, alarms and findings. `has_report`: with a link to the
+/// report.
+pub(super) fn template(has_report: bool) -> String {
+    PAGE.replacen(CATALOGUE, &catalogue(has_report).to_string(), 1)
 }
 
 /// Returns the page of one answer and its content security policy. Only the script and the style with the nonce of this
@@ -36,7 +37,7 @@ pub(super) fn answer(template: &str) -> (String, String) {
 
 /// The names and units that the page shows. The text of a rule's value 1, and of a finding of the size 1 ± 1, show the
 /// page the scale, the decimals and the unit.
-fn catalogue() -> Value {
+fn catalogue(has_report: bool) -> Value {
     let row = |(row, shown): (&'static QuantityRow, &'static Presentation)| {
         json!([row.key, row.std_key, row.unit.symbol(), shown.mqtt_name, shown.about])
     };
@@ -50,6 +51,7 @@ fn catalogue() -> Value {
     json!({
         "pack": PackValues::rows().map(row).collect::<Vec<_>>(),
         "cell": CellValues::rows().map(row).collect::<Vec<_>>(),
+        "report": has_report,
         "kept": KEPT.map(|quantity| quantity.row().key),
         "rules": Value::Object(rules.into_iter().collect()),
         "findings": Value::Object(findings.into_iter().collect()),

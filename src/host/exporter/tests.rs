@@ -15,18 +15,19 @@ use crate::status::stream_path;
 
 fn site(token_file: Option<&Path>) -> Rc<Site> {
     let access = Access::new([127, 0, 0, 1].into(), token_file).unwrap();
-    Rc::new(Site { live: Rc::default(), access, page: page::template() })
+    Rc::new(Site::new(access, None))
 }
 
-/// Starts an exporter in a thread. Returns its address.
-fn start_exporter(socket: &Path, token_file: Option<&Path>) -> SocketAddr {
+/// Starts an exporter in a thread. Returns its address, and the folder of the thread below `/proc`.
+fn start_exporter(socket: &Path, token_file: Option<&Path>) -> (SocketAddr, PathBuf) {
     let (ready, address) = mpsc::channel();
     let (socket, token_file) = (socket.to_owned(), token_file.map(Path::to_owned));
     thread::spawn(move || {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
         LocalSet::new().block_on(&runtime, async {
             let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
-            ready.send(listener.local_addr().unwrap()).unwrap();
+            let thread = Path::new("/proc").join(std::fs::read_link("/proc/thread-self").unwrap());
+            ready.send((listener.local_addr().unwrap(), thread)).unwrap();
             serve(listener, site(token_file.as_deref()), socket).await.unwrap();
         });
     });
@@ -101,7 +102,7 @@ fn wait_for_line(stream: &mut BufReader<std::net::TcpStream>, start: &str) -> St
 #[test]
 fn page_and_events_are_served_with_policy() {
     let folder = tempfile::tempdir().unwrap();
-    let address = start_exporter(&folder.path().join("status.sock"), None);
+    let (address, _) = start_exporter(&folder.path().join("status.sock"), None);
     let page = get(address, "/", "");
     let nonce = page.split("'nonce-").nth(1).and_then(|rest| rest.split('\'').next()).unwrap();
     for wanted in
@@ -112,7 +113,9 @@ fn page_and_events_are_served_with_policy() {
     assert!(!page.contains("NONCE") && !page.contains("CATALOGUE"));
     let other = get(address, "/", "");
     assert!(!other.contains(nonce), "the nonce changes");
-    assert!(get(address, "/nonsense", "").starts_with("HTTP/1.1 404"));
+    for path in ["/nonsense", "/report"] {
+        assert!(get(address, path, "").starts_with("HTTP/1.1 404"), "{path}");
+    }
     assert!(get(address, "/-/healthy", "").ends_with("healthy\n"));
 }
 
@@ -121,7 +124,7 @@ fn one_upstream_connection_serves_all_clients_and_recovers() {
     let folder = tempfile::tempdir().unwrap();
     let socket = folder.path().join("status.sock");
     let daemon = FakeDaemon::start(&socket, sample(4));
-    let address = start_exporter(&socket, None);
+    let (address, _) = start_exporter(&socket, None);
     let mut clients: Vec<_> = (0..5).map(|_| send(address, "/events", "")).collect();
     for client in &mut clients {
         assert_eq!(wait_for_line(client, "content-type"), "content-type: text/event-stream");
@@ -130,11 +133,11 @@ fn one_upstream_connection_serves_all_clients_and_recovers() {
         let document: StatusDocument = serde_json::from_str(&line["data: ".len()..]).unwrap();
         assert_eq!(document, sample(4));
     }
-    assert!(get(address, "/metrics", "").contains("packwatch_up 1\n"));
+    assert!(get(address, "/metrics", "").contains("packwatch_up 1"));
     assert_eq!(daemon.connections.load(Ordering::Relaxed), 1);
     drop(daemon);
     clients.iter_mut().for_each(|client| drop(wait_for_line(client, "event: gone")));
-    assert!(get(address, "/metrics", "").ends_with("packwatch_up 0\n"));
+    assert!(get(address, "/metrics", "").contains("packwatch_up 0"));
     let _daemon = FakeDaemon::start(&socket, sample(4));
     clients.iter_mut().for_each(|client| drop(wait_for_line(client, "data: {")));
     let mut late = send(address, "/events", "");
@@ -148,7 +151,7 @@ fn token_opens_every_path_but_liveness() {
     let folder = tempfile::tempdir().unwrap();
     let (socket, file) = (folder.path().join("status.sock"), folder.path().join("token"));
     std::fs::write(&file, "0123456789abcdef\n").unwrap();
-    let address = start_exporter(&socket, Some(&file));
+    let (address, _) = start_exporter(&socket, Some(&file));
     for path in ["/", "/events", "/metrics", "/?token=0123456789abcdeF", "/?token=", "/nonsense"] {
         assert!(get(address, path, "").starts_with("HTTP/1.1 401"), "{path}");
     }
