@@ -77,8 +77,8 @@ const PLAIN: &str = "text/plain; charset=utf-8";
 const EVENTS: &str = "text/event-stream";
 const NO_REPORT: &str = "this program makes no reports: run packwatch report --state DIR on a computer\n";
 const NEEDS_TOKEN: &str = "needs the token: open /?token=TOKEN once, or send the header Authorization: Bearer TOKEN\n";
-const ONLY_LOCAL: &str =
-    "on an address of a network, the page needs a token: start packwatch exporter with --token-file\n";
+const ONLY_LOCAL: &str = "needs a token unless you open http://127.0.0.1 or http://localhost on this computer: start packwatch \
+    exporter with --token-file\n";
 
 /// Makes the report of a store's folder; `None` = this program cannot make reports.
 pub type ReportMaker = Option<fn(&Path) -> Result<String, String>>;

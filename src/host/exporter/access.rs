@@ -8,6 +8,9 @@
 //! A client sends the token as `Authorization: Bearer TOKEN`, or once as `?token=TOKEN`. In the second case the answer
 //! sets a cookie and redirects to the address without the token, so that the token does not stay in the browser's
 //! history. The liveness check needs no token.
+//!
+//! Without a token, the page must be requested by a numeric address or as `localhost`. Otherwise a foreign page in a
+//! browser on this computer could read it under a name that it lets point to this computer (DNS rebinding).
 
 use std::fs;
 use std::hint::black_box;
@@ -15,7 +18,7 @@ use std::net::IpAddr;
 use std::path::Path;
 
 use hyper::Request;
-use hyper::header::{AUTHORIZATION, COOKIE};
+use hyper::header::{AUTHORIZATION, COOKIE, HOST};
 
 /// Fewest characters of a token. 16 hexadecimal digits are 64 bits.
 const MIN_TOKEN: usize = 16;
@@ -58,11 +61,12 @@ impl Access {
 
     pub(super) fn decide<B>(&self, request: &Request<B>) -> Decision {
         let path = request.uri().path();
+        let header = |name| request.headers().get_all(name).iter().filter_map(|value| value.to_str().ok());
         let Some(token) = self.token.as_deref().filter(|_| path != "/-/healthy") else {
-            let is_open = self.is_local || matches!(path, "/metrics" | "/-/healthy");
+            let is_local = self.is_local && header(HOST).all(is_numeric);
+            let is_open = is_local || matches!(path, "/metrics" | "/-/healthy");
             return if is_open { Decision::Allowed } else { Decision::OnlyLocal };
         };
-        let header = |name| request.headers().get_all(name).iter().filter_map(|value| value.to_str().ok());
         let query = request.uri().query().unwrap_or_default();
         if query.split('&').filter_map(|pair| pair.strip_prefix("token=")).any(|given| is_equal(given, token)) {
             return Decision::SetCookie(format!("{COOKIE_NAME}={token}; Path=/; HttpOnly; SameSite=Lax"));
@@ -74,6 +78,13 @@ impl Access {
         let is_known = bearer.any(|given| is_equal(given, token)) || cookies.any(|given| is_equal(given, token));
         if is_known { Decision::Allowed } else { Decision::NeedsToken }
     }
+}
+
+/// Whether a host with an optional port is a numeric address or `localhost`.
+fn is_numeric(host: &str) -> bool {
+    let name = host.rsplit_once(':').filter(|(_, port)| port.bytes().all(|byte| byte.is_ascii_digit()));
+    let name = name.map_or(host, |(name, _)| name);
+    name == "localhost" || name.trim_matches(['[', ']']).parse::<IpAddr>().is_ok()
 }
 
 /// Compares in a time that does not depend on the position of the first difference.

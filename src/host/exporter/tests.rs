@@ -54,7 +54,9 @@ impl FakeDaemon {
                 let (mut stream, document) = (stream.unwrap(), Arc::clone(&document));
                 connections.fetch_add(1, Ordering::Relaxed);
                 thread::spawn(move || {
-                    while let Some(document) = document.lock().unwrap().clone() {
+                    loop {
+                        let document = document.lock().unwrap().clone();
+                        let Some(document) = document else { return };
                         let line = serde_json::to_string(&document).unwrap() + "\n";
                         if stream.write_all(line.as_bytes()).is_err() {
                             return;
@@ -83,7 +85,7 @@ impl Drop for FakeDaemon {
 fn send(address: SocketAddr, path: &str, headers: &str) -> BufReader<std::net::TcpStream> {
     let mut stream = std::net::TcpStream::connect(address).unwrap();
     stream.set_read_timeout(Some(Duration::from_secs(20))).unwrap();
-    write!(stream, "GET {path} HTTP/1.1\r\nHost: x\r\nConnection: close\r\n{headers}\r\n").unwrap();
+    write!(stream, "GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n{headers}\r\n").unwrap();
     BufReader::new(stream)
 }
 
@@ -171,18 +173,22 @@ fn token_opens_every_path_but_liveness() {
 }
 
 #[test]
-fn network_without_token_gets_metrics_only() {
-    let decide = |address: [u8; 4], path| {
-        Access::new(address.into(), None).unwrap().decide(&Request::builder().uri(path).body(()).unwrap())
+fn page_without_token_is_for_this_computer_only() {
+    let decide = |address: [u8; 4], host: &str, path| {
+        let request = Request::builder().uri(path).header("host", host).body(()).unwrap();
+        Access::new(address.into(), None).unwrap().decide(&request)
     };
-    for (path, on_network) in [
+    for (path, elsewhere) in [
         ("/metrics", Decision::Allowed),
         ("/-/healthy", Decision::Allowed),
         ("/", Decision::OnlyLocal),
         ("/events?token=0123456789abcdef", Decision::OnlyLocal),
     ] {
-        assert_eq!(decide([127, 0, 0, 1], path), Decision::Allowed, "{path}");
-        assert_eq!(decide([0, 0, 0, 0], path), on_network, "{path}");
+        for host in ["localhost", "localhost:9558", "127.0.0.1:9558", "[::1]:9558", "[::1]"] {
+            assert_eq!(decide([127, 0, 0, 1], host, path), Decision::Allowed, "{host} {path}");
+        }
+        assert_eq!(decide([127, 0, 0, 1], "localhost.example.org:9558", path), elsewhere, "{path}");
+        assert_eq!(decide([0, 0, 0, 0], "127.0.0.1:9558", path), elsewhere, "{path}");
     }
 }
 
