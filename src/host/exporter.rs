@@ -249,7 +249,7 @@ fn with(mut answer: Answer, name: HeaderName, value: &str) -> Answer {
 async fn report(site: &Site) -> Answer {
     let Some(make) = site.report else { return respond(StatusCode::NOT_FOUND, PLAIN, NO_REPORT) };
     let store = site.live.document().await.and_then(|document| document.store);
-    let folder = store.and_then(|store| Some(Path::new(&store.path).parent()?.to_owned()));
+    let folder = store.map(|store| PathBuf::from(store.path));
     let Some(folder) = folder else { return respond(StatusCode::NOT_FOUND, PLAIN, "no daemon with a store answers\n") };
     let Ok(permit) = Arc::clone(&site.report_permit).acquire_owned().await else {
         return respond(StatusCode::SERVICE_UNAVAILABLE, PLAIN, "the exporter stops\n");
