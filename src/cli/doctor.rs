@@ -64,7 +64,9 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let mut report = if args.logs.is_empty() {
         listen(args, &survey, &interrupt)?
     } else {
-        replay(&args.logs, &args.reading(), args.seconds, &survey, &interrupt)?
+        let (report, counts) = replay(&args.logs, &args.reading(), args.seconds, &survey, &interrupt)?;
+        print_tables(&counts.tables);
+        report
     };
     complete(&mut report, &survey);
     if !args.logs.is_empty() && args.logs.iter().all(|log| log.is_file()) {
@@ -130,12 +132,16 @@ fn again(args: &Args, changed: &mut Survey, survey: &Survey, interrupt: &Interru
 
 /// Judges logs with a configuration.
 #[cfg(feature = "lab")]
-pub(crate) fn judge(config: &Path, logs: &[PathBuf], reading: &LogReading) -> Result<WiringReport, Failure> {
+pub(crate) fn judge(
+    config: &Path,
+    logs: &[PathBuf],
+    reading: &LogReading,
+) -> Result<(WiringReport, LogCounts), Failure> {
     let mut survey = wiring_check::survey(config)?;
     survey.plan.is_csv = logs.iter().any(|log| has_table_name(log));
-    let mut report = replay(logs, reading, None, &survey, &Interrupt::default())?;
+    let (mut report, counts) = replay(logs, reading, None, &survey, &Interrupt::default())?;
     complete(&mut report, &survey);
-    Ok(report)
+    Ok((report, counts))
 }
 
 fn replay_with_bar(
@@ -160,16 +166,14 @@ fn replay(
     seconds: Option<f64>,
     survey: &Survey,
     interrupt: &Interrupt,
-) -> Result<WiringReport, Failure> {
+) -> Result<(WiringReport, LogCounts), Failure> {
     let (mut report, counts) = replay_with_bar(logs, reading, seconds, survey, interrupt).map_err(failure)?;
-    print_tables(&counts.tables);
-    if counts.bad_lines > 0 {
-        let first = counts.first_bad_line.unwrap_or_default();
+    if let Some(first) = &counts.first_bad_line {
         let mut finding = WiringFinding::new(Severity::Note, Topic::Interface, "the log has malformed lines");
         finding.seen = format!("{} of {} lines cannot be read, first {first}", counts.bad_lines, counts.lines);
         report.add(finding);
     }
-    Ok(report)
+    Ok((report, counts))
 }
 
 fn listen(args: &Args, survey: &Survey, interrupt: &Interrupt) -> Result<WiringReport, Failure> {

@@ -14,6 +14,7 @@ use super::common::logs::{CsvSign, InputArgs, channel, charge_positive, column};
 use super::common::output::{failure, named, print, word};
 use super::discover::{self, Known, Positive, Search};
 use super::{doctor, report};
+use crate::io::log::LogCounts;
 use crate::io::result_file::check_place;
 use crate::lab::discover::PackConfiguration;
 use crate::lab::report::Verdict;
@@ -55,7 +56,9 @@ pub(crate) struct Args {
 
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
-    check_place(&args.out, discover::inputs(&args.files, &args.known).chain(&args.write)).map_err(Failure::new)?;
+    let inputs = || discover::inputs(&args.files, &args.known);
+    args.write.iter().try_for_each(|write| check_place(write, inputs())).map_err(Failure::new)?;
+    check_place(&args.out, inputs().chain(&args.write)).map_err(Failure::new)?;
     if let Some(file) = args.files.iter().find(|file| *file == Path::new("-") || file.exists() && !file.is_file()) {
         return Err(named(file, "must be a file, because `look` reads its logs several times"));
     }
@@ -75,7 +78,10 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         })?
     };
     print(&section("configuration", lines))?;
-    let survey = doctor::judge(&config, &args.files, &args.reading())?;
+    let (survey, counts) = doctor::judge(&config, &args.files, &args.reading())?;
+    if !counts.tables.is_empty() {
+        print(&section("rows", damage(&counts)))?;
+    }
     print(&section("wiring", wiring(&survey)))?;
     let page = report::Args {
         config: Some(config),
@@ -131,8 +137,15 @@ fn logs(args: &Args, search: &Search) -> Vec<String> {
     }
     let interfaces = search.interfaces().join(", ");
     lines.push(format!("{} frames in {:.0} s on {interfaces}", discovery.frames, discovery.seconds));
-    lines.extend(counts.first_bad_line.iter().map(|first| format!("{} bad lines, first {first}", counts.bad_lines)));
+    lines.extend(damage(counts));
     lines
+}
+
+/// What is wrong with the lines of the logs.
+fn damage(counts: &LogCounts) -> Vec<String> {
+    let bad = counts.first_bad_line.iter().map(|first| format!("{} bad lines, first {first}", counts.bad_lines));
+    let back = counts.first_time_backwards.iter();
+    bad.chain(back.map(|first| format!("{} stamps backwards, first {first}", counts.time_backwards))).collect()
 }
 
 /// The best candidate of each quantity.

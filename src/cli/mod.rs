@@ -75,7 +75,7 @@ enum Command {
     Run(Box<run::Args>),
     /// Show the status of the running daemon: pack, cells, alarms, interfaces
     Status(status::Args),
-    /// Serve the status of the running daemon as metrics for Prometheus
+    /// Serve the status of the running daemon as a live page and as metrics for Prometheus
     Exporter(exporter::Args),
     /// Send the status of the running daemon to an MQTT broker (needs packwatch-uplink)
     #[command(disable_help_flag = true)]

@@ -91,6 +91,18 @@ pub(crate) fn write(args: &Args) -> Result<Verdict, Failure> {
     Ok(Verdict::of(&data, &context))
 }
 
+/// The page of the store in `folder`.
+pub(crate) fn page_of_store(folder: &Path) -> Result<String, String> {
+    let text = |failure: Failure| failure.message;
+    let (data, provenance, vehicle, snapshot) = load_store(folder).map_err(text)?;
+    let title = if vehicle.is_stated() { vehicle.to_string() } else { "Battery".to_owned() };
+    let model = cell_model(snapshot.as_ref(), None).map_err(text)?;
+    let diagnosis = snapshot.as_ref().and_then(Snapshot::diagnosis);
+    let imbalance = snapshot.as_ref().and_then(Snapshot::imbalance);
+    let context = PageContext { title, model, diagnosis, imbalance, provenance, ..PageContext::default() };
+    Ok(report::page(&data, &context))
+}
+
 /// Text of the configuration, merged with its drop-ins.
 fn config_text(path: &Path) -> Result<String, Failure> {
     match ConfigFiles::find(path)?.drop_ins.is_empty() {

@@ -1,10 +1,12 @@
-//! The exporter serves the daemon's status as metrics over HTTP. The exporter is a separate process, so its faults
-//! cannot affect the estimation loop.
+//! The exporter serves the daemon's status over HTTP: metrics, a live page and its events. The exporter is a separate
+//! process, so its faults cannot affect the estimation loop.
 //!
-//! * `/metrics`: each scrape reads the daemon's status from its socket. If no status arrives within [`STATUS_LIMIT`],
-//!   the answer contains only `packwatch_up 0`. Clients that accept OpenMetrics 1.0 receive that format; other clients
-//!   receive Prometheus' text format 0.0.4.
-//! * `/`: a short page; `/-/healthy`: a liveness check.
+//! * One connection to the daemon's stream serves all clients ([`Live`]).
+//! * `/metrics`: without a recent status, the answer contains only `packwatch_up 0`. Clients that accept OpenMetrics 1.0
+//!   receive that format; other clients receive Prometheus' text format 0.0.4.
+//! * `/`: the live page; `/events`: its server-sent events; `/-/healthy`: a liveness check.
+//! * `/report`: the report of the daemon's store, if this program can make reports.
+//! * On the address of a network, the page and the events need a token ([`Access`]).
 //! * At most [`MAX_CONNECTIONS`] connections are open, and [`MAX_PER_ADDRESS`] per client address. A further connection
 //!   replaces the one that has been idle longest. If none has been idle for long enough, the further connection is
 //!   closed ([`ConnectionSlots`]).
@@ -12,33 +14,40 @@
 //!   not read.
 //! * SIGTERM and SIGINT stop the exporter cleanly.
 
-use std::cell::Cell;
+mod access;
+mod live;
+mod page;
+
 use std::convert::Infallible;
 use std::io;
 use std::net::SocketAddr;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::pin::pin;
 use std::rc::Rc;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use http_body_util::Full;
 use hyper::body::{Bytes, Incoming};
-use hyper::header::{ACCEPT, ALLOW, CONTENT_TYPE, HeaderMap, HeaderValue};
+use hyper::header::{
+    ACCEPT, ALLOW, CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, HeaderMap, HeaderName, HeaderValue, LOCATION,
+    REFERRER_POLICY, SET_COOKIE, WWW_AUTHENTICATE, X_CONTENT_TYPE_OPTIONS,
+};
 use hyper::server::conn::http1;
 use hyper::service::service_fn;
 use hyper::{Method, Request, Response, StatusCode};
 use hyper_util::rt::{TokioIo, TokioTimer};
 use sd_notify::NotifyState;
-use tokio::io::AsyncReadExt;
-use tokio::net::{TcpListener, TcpStream, UnixStream};
-use tokio::task::{JoinSet, LocalSet};
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::Semaphore;
+use tokio::task::{JoinSet, LocalSet, spawn_blocking};
 use tokio::time::{sleep, timeout};
 
+use self::access::{Access, Decision};
+use self::live::{AnswerBody, Live};
 use super::io::connection_slots::{Activity, ConnectionSlots, SlotLimits};
 use super::io::stop::Stop;
 use super::service::notify;
-use super::status::client::{check_length, explain, parse};
-use super::status::document::StatusDocument;
 use super::status::metrics::{openmetrics, prometheus_text};
 
 /// Maximum number of connections. This is several times the need of two Prometheus servers and a browser.
@@ -56,8 +65,6 @@ const CONNECTION_LIMIT: Duration = Duration::from_secs(300);
 /// Time to finish the current answer when a connection reaches [`CONNECTION_LIMIT`]. By default, Prometheus waits this
 /// long for a scrape.
 const ANSWER_LIMIT: Duration = Duration::from_secs(10);
-/// Longest time to read the daemon's status. This is less than the ten seconds that Prometheus waits for a scrape.
-const STATUS_LIMIT: Duration = Duration::from_secs(3);
 /// Time to finish the current answers when the exporter stops.
 const DRAIN_LIMIT: Duration = Duration::from_secs(1);
 /// Pause after a connection could not be accepted.
@@ -67,25 +74,36 @@ const OPENMETRICS: &str = "application/openmetrics-text; version=1.0.0; charset=
 const PROMETHEUS_TEXT: &str = "text/plain; version=0.0.4; charset=utf-8";
 const HTML: &str = "text/html; charset=utf-8";
 const PLAIN: &str = "text/plain; charset=utf-8";
-const PAGE: &str = "<!DOCTYPE html><html lang=\"en\"><head><title>packwatch</title></head><body><h1>packwatch</h1>\
-    <p><a href=\"/metrics\">metrics</a></p></body></html>\n";
+const EVENTS: &str = "text/event-stream";
+const NO_REPORT: &str = "this program makes no reports: run packwatch report --state DIR on a computer\n";
+const NEEDS_TOKEN: &str = "needs the token: open /?token=TOKEN once, or send the header Authorization: Bearer TOKEN\n";
+const ONLY_LOCAL: &str = "needs a token unless you open http://127.0.0.1 or http://localhost on this computer: start packwatch \
+    exporter with --token-file\n";
 
-/// The status socket, and whether the daemon answered the last request.
-#[derive(Debug)]
-struct StatusSource {
-    path: PathBuf,
-    is_up: Cell<Option<bool>>,
+/// Makes the report of a store's folder; `None` = this program cannot make reports.
+pub type ReportMaker = Option<fn(&Path) -> Result<String, String>>;
+
+/// What all connections share.
+struct Site {
+    live: Rc<Live>,
+    access: Access,
+    page: String,
+    report: ReportMaker,
+    /// One report is made at a time.
+    report_permit: Arc<Semaphore>,
 }
 
-/// Reads the daemon's status from `socket` and serves it on the address `listen`, until a signal stops the exporter.
+/// Follows the daemon's status next to `socket` and serves it on the address `listen`, until a signal stops the
+/// exporter. `token_file` is the file with the token that clients must know.
 ///
 /// # Errors
-/// Fails if the address cannot be bound.
-pub fn run(listen: SocketAddr, socket: PathBuf) -> Result<(), String> {
+/// Fails if the token cannot be read, or if the address cannot be bound.
+pub fn run(listen: SocketAddr, socket: &Path, token_file: Option<&Path>, report: ReportMaker) -> Result<(), String> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
     let runtime = runtime.map_err(|error| format!("cannot start: {error}"))?;
-    let source = Rc::new(StatusSource { path: socket, is_up: Cell::new(None) });
-    let served = async { serve(TcpListener::bind(listen).await?, source).await };
+    let access = Access::new(listen.ip(), token_file)?;
+    let site = Site::new(access, report);
+    let served = async { serve(TcpListener::bind(listen).await?, Rc::new(site), socket.to_owned()).await };
     let served = LocalSet::new().block_on(&runtime, served);
     served.map_err(|error| {
         format!(
@@ -94,14 +112,26 @@ pub fn run(listen: SocketAddr, socket: PathBuf) -> Result<(), String> {
     })
 }
 
-async fn serve(listener: TcpListener, source: Rc<StatusSource>) -> io::Result<()> {
+impl Site {
+    fn new(access: Access, report: ReportMaker) -> Self {
+        let report_permit = Arc::new(Semaphore::new(1));
+        Self { live: Rc::default(), access, page: page::template(report.is_some()), report, report_permit }
+    }
+}
+
+async fn serve(listener: TcpListener, site: Rc<Site>, socket: PathBuf) -> io::Result<()> {
     let mut stop = Stop::new(None)?;
     let address = listener.local_addr()?;
-    tracing::info!(%address, socket = %source.path.display(), "exporter listening");
+    tracing::info!(%address, socket = %socket.display(), "exporter listening");
+    if !site.access.has_page() {
+        tracing::warn!("serving only metrics: the page needs --token-file on an address of a network");
+    }
     let status = format!("listening on {address}");
     notify(&[NotifyState::Ready, NotifyState::Status(&status)]);
     let mut places = ConnectionSlots::new(SlotLimits { total: MAX_CONNECTIONS, per_client: MAX_PER_ADDRESS });
     let mut connections = JoinSet::new();
+    let live = Rc::clone(&site.live);
+    let follower = tokio::task::spawn_local(async move { live.follow(&socket).await });
     loop {
         let accepted = tokio::select! {
             () = stop.wait() => break,
@@ -114,7 +144,7 @@ async fn serve(listener: TcpListener, source: Rc<StatusSource>) -> io::Result<()
             }
             Ok((stream, client)) => {
                 let activity = Activity::new();
-                let task = connections.spawn_local(serve_connection(stream, Rc::clone(&source), activity.clone()));
+                let task = connections.spawn_local(serve_connection(stream, Rc::clone(&site), activity.clone()));
                 places.take(client.ip(), activity, task);
             }
             Err(error) => {
@@ -125,6 +155,7 @@ async fn serve(listener: TcpListener, source: Rc<StatusSource>) -> io::Result<()
     }
     notify(&[NotifyState::Stopping]);
     drop(listener);
+    follower.abort();
     // The current answers get a short time to finish. Then the remaining connections are closed, because an idle
     // connection would stay open.
     let drained = async { while connections.join_next().await.is_some() {} };
@@ -133,12 +164,13 @@ async fn serve(listener: TcpListener, source: Rc<StatusSource>) -> io::Result<()
     Ok(())
 }
 
-async fn serve_connection(stream: TcpStream, source: Rc<StatusSource>, activity: Activity) {
+async fn serve_connection(stream: TcpStream, site: Rc<Site>, activity: Activity) {
+    let end = Instant::now() + CONNECTION_LIMIT;
     let answer = service_fn(move |request| {
-        let (source, activity) = (Rc::clone(&source), activity.clone());
+        let (site, activity) = (Rc::clone(&site), activity.clone());
         async move {
             activity.begin_request();
-            let answer = answer(&request, &source).await;
+            let answer = answer(&request, &site, &activity, end).await;
             activity.end_request();
             Ok::<_, Infallible>(answer)
         }
@@ -160,31 +192,81 @@ async fn serve_connection(stream: TcpStream, source: Rc<StatusSource>, activity:
     }
 }
 
-type Answer = Response<Full<Bytes>>;
+type Answer = Response<AnswerBody>;
 
-async fn answer(request: &Request<Incoming>, source: &StatusSource) -> Answer {
+async fn answer(request: &Request<Incoming>, site: &Site, activity: &Activity, end: Instant) -> Answer {
     if !matches!(*request.method(), Method::GET | Method::HEAD) {
-        let mut refused = respond(StatusCode::METHOD_NOT_ALLOWED, PLAIN, "must be GET or HEAD\n");
-        refused.headers_mut().insert(ALLOW, HeaderValue::from_static("GET, HEAD"));
-        return refused;
+        let refused = respond(StatusCode::METHOD_NOT_ALLOWED, PLAIN, "must be GET or HEAD\n");
+        return with(refused, ALLOW, "GET, HEAD");
     }
-    match request.uri().path() {
-        "/metrics" => metrics(request.headers(), source).await,
-        "/" => respond(StatusCode::OK, HTML, PAGE),
+    let path = request.uri().path();
+    match site.access.decide(request) {
+        Decision::Allowed => {}
+        Decision::SetCookie(cookie) => {
+            let moved = respond(StatusCode::SEE_OTHER, PLAIN, "the token is accepted\n");
+            return with(with(moved, LOCATION, path), SET_COOKIE, &cookie);
+        }
+        Decision::NeedsToken => {
+            let refused = respond(StatusCode::UNAUTHORIZED, PLAIN, NEEDS_TOKEN);
+            return with(refused, WWW_AUTHENTICATE, "Bearer");
+        }
+        Decision::OnlyLocal => return respond(StatusCode::FORBIDDEN, PLAIN, ONLY_LOCAL),
+    }
+    match path {
+        "/metrics" => metrics(request.headers(), &site.live).await,
+        "/" => {
+            let (page, policy) = page::answer(&site.page);
+            let answer = with(respond(StatusCode::OK, HTML, page), CONTENT_SECURITY_POLICY, &policy);
+            with(answer, REFERRER_POLICY, "no-referrer")
+        }
+        "/events" => answer_with(StatusCode::OK, EVENTS, site.live.events(activity.clone(), end)),
+        "/report" => report(site).await,
         "/-/healthy" => respond(StatusCode::OK, PLAIN, "healthy\n"),
-        _ => respond(StatusCode::NOT_FOUND, PLAIN, "must be /, /metrics or /-/healthy\n"),
+        _ => respond(StatusCode::NOT_FOUND, PLAIN, "must be /, /events, /report, /metrics or /-/healthy\n"),
     }
 }
 
 fn respond(status: StatusCode, kind: &'static str, text: impl Into<Bytes>) -> Answer {
-    let mut response = Response::new(Full::new(text.into()));
-    *response.status_mut() = status;
-    response.headers_mut().insert(CONTENT_TYPE, HeaderValue::from_static(kind));
-    response
+    answer_with(status, kind, AnswerBody::Whole(Full::new(text.into())))
 }
 
-async fn metrics(headers: &HeaderMap, source: &StatusSource) -> Answer {
-    let text = openmetrics(source.read().await);
+fn answer_with(status: StatusCode, kind: &'static str, body: AnswerBody) -> Answer {
+    let mut response = Response::new(body);
+    *response.status_mut() = status;
+    let response = with(response, CONTENT_TYPE, kind);
+    with(with(response, CACHE_CONTROL, "no-store"), X_CONTENT_TYPE_OPTIONS, "nosniff")
+}
+
+/// Adds a header; leaves it out if the value is not valid.
+fn with(mut answer: Answer, name: HeaderName, value: &str) -> Answer {
+    if let Ok(value) = HeaderValue::from_str(value) {
+        answer.headers_mut().insert(name, value);
+    }
+    answer
+}
+
+/// Makes the report of the daemon's store.
+async fn report(site: &Site) -> Answer {
+    let Some(make) = site.report else { return respond(StatusCode::NOT_FOUND, PLAIN, NO_REPORT) };
+    let store = site.live.document().await.and_then(|document| document.store);
+    let folder = store.map(|store| PathBuf::from(store.path));
+    let Some(folder) = folder else { return respond(StatusCode::NOT_FOUND, PLAIN, "no daemon with a store answers\n") };
+    let Ok(permit) = Arc::clone(&site.report_permit).acquire_owned().await else {
+        return respond(StatusCode::SERVICE_UNAVAILABLE, PLAIN, "the exporter stops\n");
+    };
+    let made = spawn_blocking(move || {
+        let _permit = permit;
+        make(&folder)
+    });
+    match made.await {
+        Ok(Ok(page)) => respond(StatusCode::OK, HTML, page),
+        Ok(Err(error)) => respond(StatusCode::INTERNAL_SERVER_ERROR, PLAIN, error + "\n"),
+        Err(error) => respond(StatusCode::INTERNAL_SERVER_ERROR, PLAIN, format!("no report: {error}\n")),
+    }
+}
+
+async fn metrics(headers: &HeaderMap, live: &Live) -> Answer {
+    let text = openmetrics(live.document().await);
     if wants_openmetrics(headers) {
         respond(StatusCode::OK, OPENMETRICS, text)
     } else {
@@ -207,85 +289,5 @@ fn wants_openmetrics(headers: &HeaderMap) -> bool {
     })
 }
 
-impl StatusSource {
-    /// Reads the daemon's status; `None` = no valid status was received in time. Logs when the daemon starts or stops
-    /// answering.
-    async fn read(&self) -> Option<StatusDocument> {
-        let line = timeout(STATUS_LIMIT, self.line()).await.unwrap_or_else(|late| Err(late.into()));
-        let document = line.map_err(|error| explain(&self.path, "--socket", &error)).and_then(|line| parse(&line));
-        let was_up = self.is_up.replace(Some(document.is_ok()));
-        match &document {
-            Ok(_) if was_up != Some(true) => tracing::info!("the daemon reports its status"),
-            Err(error) if was_up != Some(false) => tracing::warn!(error, "no status from the daemon"),
-            Ok(_) | Err(_) => {}
-        }
-        document.ok()
-    }
-
-    async fn line(&self) -> io::Result<Vec<u8>> {
-        let mut stream = UnixStream::connect(&self.path).await?;
-        let mut line = Vec::new();
-        while line.last() != Some(&b'\n') {
-            if stream.read_buf(&mut line).await? == 0 {
-                return Err(io::ErrorKind::UnexpectedEof.into());
-            }
-            check_length(line.len())?;
-        }
-        Ok(line)
-    }
-}
-
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn scrape_displaces_slow_clients() {
-        use tokio::io::AsyncWriteExt as _;
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
-        LocalSet::new().block_on(&runtime, async {
-            let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
-            let address = listener.local_addr().unwrap();
-            let source = StatusSource { path: PathBuf::from("/nonexistent/status.sock"), is_up: Cell::new(None) };
-            let server = tokio::task::spawn_local(serve(listener, Rc::new(source)));
-            let mut slow = Vec::new();
-            for _ in 0..2 * MAX_CONNECTIONS {
-                let mut client = TcpStream::connect(address).await.unwrap();
-                // The client may already have been rejected.
-                let _ = client.write_all(b"GET /met").await;
-                slow.push(client);
-            }
-            sleep(crate::io::connection_slots::GRACE).await;
-            let began = Instant::now();
-            let mut scrape = TcpStream::connect(address).await.unwrap();
-            scrape.write_all(b"GET /metrics HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n").await.unwrap();
-            let mut answer = String::new();
-            scrape.read_to_string(&mut answer).await.unwrap();
-            assert!(answer.starts_with("HTTP/1.1 200") && answer.contains("packwatch_up 0"), "{answer}");
-            assert!(began.elapsed() < STATUS_LIMIT, "{:?}", began.elapsed());
-            server.abort();
-        });
-    }
-
-    #[test]
-    fn openmetrics_is_sent_if_version_1_accepted() {
-        for (accept, wanted) in [
-            // This is the header of Prometheus 2.42.
-            (
-                "application/openmetrics-text;version=1.0.0,application/openmetrics-text;version=0.0.1;q=0.75,\
-                 text/plain;version=0.0.4;q=0.5,*/*;q=0.1",
-                true,
-            ),
-            ("application/openmetrics-text; version=\"1.0.0\"; charset=utf-8", true),
-            ("text/plain;version=0.0.4", false),
-            ("application/openmetrics-text;version=0.0.1", false),
-            ("application/openmetrics-text;version=1.0.0;q=0", false),
-            ("*/*", false),
-        ] {
-            let mut headers = HeaderMap::new();
-            headers.insert(ACCEPT, HeaderValue::from_static(accept));
-            assert_eq!(wants_openmetrics(&headers), wanted, "{accept}");
-        }
-        assert!(!wants_openmetrics(&HeaderMap::new()));
-    }
-}
+mod tests;

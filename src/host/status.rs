@@ -31,6 +31,7 @@ mod quantities;
 #[path = "status/tests/sample.rs"]
 pub mod sample;
 mod server;
+pub mod stream;
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;

@@ -126,7 +126,7 @@ mod tests {
         let found = read("time_s,current_a,voltage_v\n0,1,3.5\n1,x,3.5\n");
         assert_eq!(
             found,
-            Err("cell.csv:3: column current_a: found \"x\", must be a finite number or an empty field".into())
+            Err("cell.csv:3: column current_a: found \"x\", must be a finite number, empty, - or n/a".into())
         );
         let rows: String = (0..200).map(|n| format!("{n},1,3.5\n")).collect();
         let file = read(&format!("time_s,current_a,voltage_v\n{rows}x,1,3.5\n")).expect("one bad row of 201");

@@ -378,8 +378,8 @@ impl PlausibleRanges {
         let rows = time_s.rows.min(MOST_ROWS);
         plausible::check_charge(&time_s.values[..rows], &input.current_a.values[..rows], self.capacity_ah).map_err(
             |of| {
-                let unit = of.probable.unwrap_or("ms");
-                data(format!("time_s must be seconds, probably {unit}: {}", of.what))
+                let probably = of.probable.map_or_else(String::new, |unit| format!(", probably {unit}"));
+                data(format!("time_s must be seconds{probably}: {}", of.what))
             },
         )
     }

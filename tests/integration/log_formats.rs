@@ -182,6 +182,23 @@ fn look_writes_report_or_asks() {
     }
     let text = stderr(&packwatch(&["look", &table, "--out", &out]).code(1));
     assert!(text.contains("which battery is it?"), "{text}");
+    // A configuration that exists replaces the label. What cannot be read is named.
+    let own = path("table.toml");
+    let [first, again] = [&["--label", "nmc:2.6Ah"][..], &[]].map(|label| {
+        let output = packwatch(&[&["look", &table, "--out", &out, "--write", &own], label].concat()).success();
+        assert_eq!(stderr(&output).matches("drive.csv").count(), 1, "the table is named once");
+        stdout(&output)
+    });
+    assert!(!first.contains("cannot be read") && again.contains("exists, so it is used as it is"), "{first}{again}");
+    let text = stderr(&packwatch(&["look", &table, "--out", &out, "--write", &table]).code(1));
+    assert!(text.contains("drive.csv: is an input"), "{text}");
+    let rows: String = (0..900).map(row).collect();
+    fs::write(&table, format!("time,current,voltage\n{rows}900,{},3.7\n901,1,3.7\n", " ".repeat(3_000_000))).unwrap();
+    let text = stdout(&packwatch(&["look", &table, "--label", "nmc:2.6Ah", "--out", &out]).success());
+    assert!(text.contains("the rest of the file is not read"), "{text}");
+    fs::write(&table, "").unwrap();
+    let text = stderr(&packwatch(&["look", &table, "--label", "nmc:2.6Ah:4s", "--out", &out]).code(1));
+    assert_eq!(text.matches("drive.csv: is empty").count(), 1, "{text}");
     // An edited configuration is used and kept.
     let edited = fs::read_to_string(&pack).unwrap().replace("rated_capacity_ah = 2.6", "rated_capacity_ah = 2.5");
     fs::write(&pack, &edited).unwrap();

@@ -443,7 +443,7 @@ fn csv_rows_become_frames_bad_fields_are_named() {
     assert_eq!((counts.lines, counts.frames, counts.bad_lines), (7, 5, 2));
     let first = counts.first_bad_line.expect("shown");
     assert!(
-        first.ends_with("a.csv:5: column voltage_v: found \"oops\", must be a finite number or an empty field"),
+        first.ends_with("a.csv:5: column voltage_v: found \"oops\", must be a finite number, empty, - or n/a"),
         "{first}"
     );
     let data = |record: &Record| match &record.kind {

@@ -1,7 +1,10 @@
 #!/usr/bin/env python3
 """Opens a page in a headless Chromium and prints its requests and its console messages.
 
-usage: look_at_page.py CHROMIUM PAGE.html WIDTH HEIGHT light|dark [SHOT.png] [PRINT.pdf]
+usage: look_at_page.py CHROMIUM PAGE.html|URL WIDTH HEIGHT light|dark [SHOT.png] [PRINT.pdf]
+
+For a URL, answers JavaScript expressions first: one per line on standard input, one line of JSON each on standard output. The
+expression `shot FILE.png` takes a picture.
 
 Prints one JSON document: requests (other than the page itself), messages, overflow_px (excess width of the page over the
 window). Speaks the DevTools protocol over a pipe; needs only Python's standard library.
@@ -71,15 +74,26 @@ def look(browser, page, width, height, scheme, shot, print_to):
         browser.call(f"{domain}.enable")
     browser.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 640)
     browser.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
-    url = pathlib.Path(page).resolve().as_uri()
+    is_live = page.startswith("http://")
+    url = page if is_live else pathlib.Path(page).resolve().as_uri()
     browser.call("Page.navigate", url=url)
     if not any(event["method"] == "Page.loadEventFired" for event in browser.events):
         browser.wait(lambda message: message.get("method") == "Page.loadEventFired")
-    wide = browser.call("Runtime.evaluate", returnByValue=True,
-                        expression=f"document.documentElement.scrollWidth - {width}")["result"]["value"]
-    if shot:
+
+    def evaluate(expression):
+        return browser.call("Runtime.evaluate", returnByValue=True, expression=expression)["result"].get("value")
+
+    def photograph(to):
         data = browser.call("Page.captureScreenshot", format="png", captureBeyondViewport=True)["data"]
-        pathlib.Path(shot).write_bytes(base64.b64decode(data))
+        pathlib.Path(to).write_bytes(base64.b64decode(data))
+        return to
+
+    for line in sys.stdin if is_live else ():
+        answer = photograph(line[5:].strip()) if line.startswith("shot ") else evaluate(line)
+        print(json.dumps(answer), flush=True)
+    wide = evaluate(f"document.documentElement.scrollWidth - {width}")
+    if shot:
+        photograph(shot)
     if print_to:
         data = browser.call("Page.printToPDF", printBackground=True, preferCSSPageSize=True)["data"]
         pathlib.Path(print_to).write_bytes(base64.b64decode(data))

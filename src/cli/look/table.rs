@@ -4,6 +4,7 @@ use std::path::Path;
 
 use super::Args;
 use crate::cli::common::files::named_from;
+use crate::config;
 use crate::io::csv_log::{CsvOptions, TableReading};
 use crate::io::log::{LogError, LogOptions, LogSource};
 use crate::lab::discover::{PackConfiguration, PackLabel};
@@ -21,6 +22,11 @@ impl PackTable {
     /// Reads the first file; `None` = it is not a table.
     pub(super) fn read(args: &Args) -> Result<Option<Self>, Failure> {
         let label = args.known.label.unwrap_or_default();
+        if let Some(file) = args.write.as_ref().filter(|file| file.exists()) {
+            let size = args.reading().options(&config::load(file)?).csv;
+            let reading = tables(args, size).map_err(|error| Failure::new(error.to_string()))?;
+            return Ok(reading.map(|reading| Self { reading, label, cells: 1, is_total: false }));
+        }
         let cells = label.cells.unwrap_or(1);
         let read = |is_total: bool| {
             let size = CsvOptions { cells, series: cells, sensors: 1, pack_total: is_total, ..CsvOptions::default() };
@@ -33,7 +39,7 @@ impl PackTable {
             Failure::new(format!("{error}{}", if is_of_voltage { hint } else { "" }))
         };
         match read(false) {
-            Err(of_cells) if cells > 1 => {
+            Err(of_cells @ LogError::Data(_)) if cells > 1 => {
                 read(true).map_err(|error: LogError| Failure::new(format!("{of_cells}\n{error}")))
             }
             found => found.map_err(failed),

@@ -24,14 +24,15 @@ use crate::quantity::{CellIndex, InvalidState, Mode, Timestamp};
 pub const POWER_S: [f64; 3] = [2.0, 10.0, 30.0];
 /// Time over which the load of a discharge is averaged (s). Over half an hour, fast and slow parts of a drive mix.
 const LOAD_S: f64 = 1800.0;
-/// A charge of at least this time counts (s). Braking ends sooner.
+/// A charge of at least this time counts (s). Braking ends sooner. A longer gap without a current is not averaged.
 const LEAST_CHARGE_S: f64 = 600.0;
 /// A charge tapers off when its current has fallen to this share of its strongest current.
 const TAPERED: f64 = 0.8;
+/// Standard deviation of the voltage at which a charger holds the fullest cell, relative to the model (V).
+const CHARGER_STD_V: f64 = 0.02;
 /// Standard deviation of ln(future load over recent load): a driver needs a third more or less in the next half hour.
 const LOG_LOAD_STD: f64 = 0.3;
-/// Time over which the current of a charge is averaged (s). A charger regulates its current. A longer gap without a
-/// current is not averaged.
+/// Time over which the current of a charge is averaged (s). A charger regulates its current.
 const CHARGER_S: f64 = 60.0;
 /// Load that is assumed before the first one was seen, per rated capacity (1/h): a vehicle that drives for five hours.
 const USUAL_LOAD_PER_H: f64 = 0.2;
@@ -55,17 +56,10 @@ pub struct OutlookConfig {
     pub max_discharge_a: Option<f64>,
     /// Largest current of a charge (A); `None` = only the voltages limit it.
     pub max_charge_a: Option<f64>,
-    /// A charge is complete when its current has fallen to this value (A); `None` = as at the end of the last charge that
-    /// tapered off, before it C/20.
-    pub taper_current_a: Option<f64>,
+    /// A charge is complete when its current has fallen to this value (A).
+    pub taper_current_a: f64,
     /// SOC for which the time of a charge is stated, fraction.
     pub target_soc: f64,
-}
-
-impl OutlookConfig {
-    fn taper_a(&self) -> f64 {
-        self.taper_current_a.unwrap_or(f64::MIN_POSITIVE)
-    }
 }
 
 /// Averages of the current while the pack is discharged, and while it is charged.
@@ -78,9 +72,8 @@ pub struct RecentLoad {
     /// Time and largest mean current of the charge in progress.
     charging_s: f64,
     strongest_a: f64,
-    /// Highest voltage of a cell while a charge tapers off, and mean current at its end.
+    /// Highest voltage of a cell while a charge tapers off (V).
     held_v: Option<f64>,
-    end_a: Option<f64>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
@@ -120,14 +113,16 @@ impl RecentLoad {
     pub fn observe(&mut self, now: Timestamp, mode: Mode, current_a: Option<f64>, rest_a: f64) {
         let seconds = self.latest.map_or(0.0, |latest| now.since(latest));
         self.latest = Some(now);
-        let Some(current_a) = current_a.filter(|_| seconds > 0.0 && seconds <= CHARGER_S) else { return };
+        let Some(current_a) = current_a.filter(|_| seconds > 0.0 && seconds <= LEAST_CHARGE_S) else { return };
         match mode {
             Mode::Charge => {
                 self.charge.add(-current_a, seconds, CHARGER_S);
                 self.charging_s += seconds;
                 self.strongest_a = self.strongest_a.max(self.charge.mean_a);
             }
-            Mode::Rest if current_a.abs() <= rest_a => self.end_charge(),
+            Mode::Rest if current_a.abs() <= rest_a => {
+                (self.charge, self.charging_s, self.strongest_a) = (Average::default(), 0.0, 0.0);
+            }
             // A load that changes its direction within seconds has no mode, but is a load.
             Mode::Discharge | Mode::Rest | Mode::Unknown => self.discharge.add(current_a, seconds, LOAD_S),
         }
@@ -144,18 +139,9 @@ impl RecentLoad {
         self.held_v = Some(held_v + 0.1 * (highest_v - held_v));
     }
 
-    fn end_charge(&mut self) {
-        if self.is_tapering(Mode::Charge) {
-            self.end_a = Some(self.charge.mean_a);
-        }
-        (self.charge, self.charging_s, self.strongest_a) = (Average::default(), 0.0, 0.0);
-    }
-
-    /// The limits, with what the last charge has shown in place of keys that are not set.
-    fn learned(&self, config: &OutlookConfig, rated_ah: f64) -> OutlookConfig {
-        let taper_a = config.taper_current_a.or(self.end_a).unwrap_or(rated_ah / 20.0);
-        let max_voltage_v = config.max_voltage_v.or(self.held_v);
-        OutlookConfig { max_voltage_v, taper_current_a: Some(taper_a), ..*config }
+    /// The limits, with the voltage that the last charge has shown if none is set.
+    fn learned(&self, config: &OutlookConfig) -> OutlookConfig {
+        OutlookConfig { max_voltage_v: config.max_voltage_v.or(self.held_v), ..*config }
     }
 
     /// The charger's current (A, positive), if the pack is being charged.
@@ -178,8 +164,8 @@ impl RecentLoad {
             InvalidState::unless_natural("the mean square of a current", average.mean_square_a2)?;
             InvalidState::unless_numbers("a mean or largest current", [average.mean_a, average.peak_a])
         })?;
-        let learned = [self.held_v, self.end_a].into_iter().flatten();
-        InvalidState::unless_naturals("a value of a charge", learned.chain([self.charging_s, self.strongest_a]))
+        let held_v = self.held_v.unwrap_or(0.0);
+        InvalidState::unless_naturals("a value of a charge", [held_v, self.charging_s, self.strongest_a])
     }
 }
 
@@ -262,8 +248,8 @@ impl CellState<'_> {
     /// Voltage (V) at a load: the mean, and the lowest at the largest current.
     fn loaded_v(&self, soc: f64, load: &Load) -> (f64, f64) {
         let (ocv_v, settled_ohm) = (self.ocv_v(soc), self.ohm(soc, f64::INFINITY));
-        let [peak_ohm, fast_ohm, _] = POWER_S.map(|after_s| self.ohm(soc, after_s));
-        (ocv_v - load.loss_v(settled_ohm, fast_ohm), ocv_v - load.peak_v(settled_ohm, peak_ohm))
+        let fast_ohm = self.ohm(soc, POWER_S[1]);
+        (ocv_v - load.loss_v(settled_ohm, fast_ohm), ocv_v - load.peak_v(settled_ohm, fast_ohm))
     }
 
     /// SOC at which the voltage at the largest current of the load falls to the lowest voltage.
@@ -310,8 +296,8 @@ impl CellState<'_> {
     /// Charge (Ah) that the cell takes up until it is full: until the taper current keeps it at its highest voltage.
     fn chargeable_ah(&self, config: &OutlookConfig) -> f64 {
         let soc = self.soc.mean;
-        let (full, _) = bisect((soc.min(1.0), 1.0), HALVINGS, |soc| self.held_a(soc, config) > config.taper_a());
-        let full = if self.held_a(1.0, config) > config.taper_a() { 1.0 } else { full };
+        let (full, _) = bisect((soc.min(1.0), 1.0), HALVINGS, |soc| self.held_a(soc, config) > config.taper_current_a);
+        let full = if self.held_a(1.0, config) > config.taper_current_a { 1.0 } else { full };
         self.capacity.mean * (full - soc).max(0.0)
     }
 
@@ -343,7 +329,7 @@ impl CellState<'_> {
         let step_ah = charge_ah / f64::from(CHARGE_STEPS);
         (0..CHARGE_STEPS).fold(0.0, |sum_s, step| {
             let soc = self.soc.mean + (f64::from(step) + 0.5) * step_ah / self.capacity.mean;
-            let held_a = self.held_a(soc, config).max(config.taper_a());
+            let held_a = self.held_a(soc, config).max(config.taper_current_a);
             sum_s + 3600.0 * step_ah / current_a.min(held_a)
         })
     }
@@ -475,7 +461,7 @@ pub fn of_pack(
     pack: &Structure,
 ) -> Option<Outlook> {
     let rated_ah = cells.first()?.model.rated_capacity_ah;
-    let config = &load.learned(config, rated_ah);
+    let config = &load.learned(config);
     let discharge = load.discharge.load();
     let drawn = discharge.unwrap_or(Load::usual(rated_ah));
     let charger_a = load.charger_a(mode).unwrap_or(USUAL_LOAD_PER_H * rated_ah);
@@ -501,11 +487,13 @@ pub fn of_pack(
         ScalarGaussian { mean: per_ah_s * charge.mean, variance }
     });
     let target_soc = fullest.soc.mean + (config.target_soc - pack.soc) * pack.capacity_ah / fullest.capacity.mean;
-    let to_target_s = |cell: &CellState<'_>| {
-        let charge_ah = (target_soc - cell.soc.mean) * cell.capacity.mean;
-        cell.charging_s(charge_ah.clamp(0.0, cell.chargeable_ah(config)), charger_a, config)
+    let charging = |value: &dyn Fn(&CellState<'_>, &OutlookConfig) -> f64| {
+        let held_v = config.max_voltage_v.unwrap_or(fullest.model.voltage_max_v);
+        let at = |change_v| value(fullest, &OutlookConfig { max_voltage_v: Some(held_v + change_v), ..*config });
+        let by_charger_s = 0.5 * (at(CHARGER_STD_V) - at(-CHARGER_STD_V));
+        let time_s = fullest.spread(|cell| value(cell, config));
+        load.charger_a(mode).map(|_| ScalarGaussian { variance: time_s.variance + square(by_charger_s), ..time_s })
     };
-    let is_charging = load.charger_a(mode).is_some();
     let power = |direction, for_s| {
         let limits = cells.iter().map(|cell| cell.limit_a(direction, for_s, config)).enumerate();
         let (index, limit) = limits.min_by(|a, b| a.1.mean.total_cmp(&b.1.mean))?;
@@ -522,9 +510,11 @@ pub fn of_pack(
         remaining_wh: whole(energy, &|cell| cell.delivered_wh(drawn_ah, &drawn)),
         to_full_wh: whole(to_full, &|cell| cell.taken_wh(taken_ah, charger_a, config)),
         to_empty_s,
-        to_full_s: is_charging
-            .then(|| fullest.spread(|cell| cell.charging_s(cell.chargeable_ah(config), charger_a, config))),
-        to_target_s: is_charging.then(|| fullest.spread(to_target_s)),
+        to_full_s: charging(&|cell, config| cell.charging_s(cell.chargeable_ah(config), charger_a, config)),
+        to_target_s: charging(&|cell, config| {
+            let charge_ah = (target_soc - cell.soc.mean) * cell.capacity.mean;
+            cell.charging_s(charge_ah.clamp(0.0, cell.chargeable_ah(config)), charger_a, config)
+        }),
         discharge_w: discharge.0,
         charge_w: charge.0,
         limiting_cells: [discharge.1, charge.1],
@@ -534,7 +524,7 @@ pub fn of_pack(
 /// Computes the outlook of one cell, regardless of the other cells.
 pub fn of_cell(config: &OutlookConfig, load: &RecentLoad, cell: &CellState<'_>) -> CellOutlook {
     let drawn = load.discharge.load().unwrap_or(Load::usual(cell.model.rated_capacity_ah));
-    let config = &load.learned(config, cell.model.rated_capacity_ah);
+    let config = &load.learned(config);
     let power = |direction| {
         let limit = cell.limit_a(direction, POWER_S[1], config);
         let voltage_v = cell.voltage_after(direction, limit.mean, POWER_S[1]);

@@ -5,7 +5,8 @@
 //! columns are found by name in a [dictionary](dictionary), or the user names them. Units are in the header, in a
 //! second header row, or after the name that the user gives. The first rows decide the rest: [judge] finds the sign of
 //! the current and units that the header does not state, and rejects values that cannot be in the stated unit. An
-//! empty field means "no reading". A row is bad if a field is missing or is not a finite number. A section column
+//! empty or missing field means "no reading", as `-` and `n/a` do. A row is bad if its time cannot be read, or if another
+//! field is neither a finite number nor such a text. A section column
 //! (`cycle`, `segment`, `ref`, or the column that the user names) divides a file into sections; time restarts in each
 //! section. If a table states the start times of the sections, the stamps are absolute. Otherwise, the gaps between the
 //! sections are unknown. [`TableReading`] says what was read as what.
@@ -78,6 +79,7 @@ pub struct CsvLog {
     time_column: usize,
     time: TimeText,
     last_time: Option<Timestamp>,
+    is_first_time_late: bool,
     /// The column of each used channel.
     channels: Vec<(Channel, Column)>,
     sign: CurrentSign,
@@ -115,7 +117,7 @@ pub fn has_table_name(path: &Path) -> bool {
 
 /// Whether a log is a table of samples, by its name or by its first bytes.
 pub(super) fn is_table(path: &Path, head: &[u8]) -> bool {
-    let first_line = head.split(|&byte| byte == b'\n').next().unwrap_or_default();
+    let first_line = after_remarks(head).split(|&byte| byte == b'\n').next().unwrap_or_default();
     let is_utf16 = head.starts_with(&[0xFF, 0xFE]) || head.starts_with(&[0xFE, 0xFF]);
     has_table_name(path)
         || (!first_line.starts_with(b"(")
@@ -123,6 +125,16 @@ pub(super) fn is_table(path: &Path, head: &[u8]) -> bool {
                 || is_utf16
                 || first_line.contains(&b',')
                 || super::table::has_header(head, &dictionary::score)))
+}
+
+/// The first bytes of a log without the comments (`#`) at its beginning. A comment may contain commas, as tables do.
+fn after_remarks(mut head: &[u8]) -> &[u8] {
+    while head.starts_with(b"#")
+        && let Some(end) = memchr::memchr(b'\n', head)
+    {
+        head = &head[end + 1..];
+    }
+    head
 }
 
 fn is_parquet(head: &[u8]) -> bool {
@@ -155,11 +167,12 @@ impl CsvLog {
         let judgement = judge::judge(&first, &mut layout, options)?;
         let sections = sections(table.header(), layout.section, options)?;
         let reading = TableReading::new(table.header(), &layout, &judgement, options);
-        let Judgement { time, sign, .. } = judgement;
+        let Judgement { time, sign, is_first_time_late, .. } = judgement;
         Ok(Self {
             time_column: layout.time.index,
             time,
             last_time: None,
+            is_first_time_late: is_first_time_late && sections.is_none(),
             values: Vec::with_capacity(layout.channels.len()),
             channels: layout.channels,
             sign,
@@ -209,6 +222,9 @@ impl CsvLog {
         let Some(time) = self.time.parse(row.bytes(self.time_column).unwrap_or_default()).filter(is_possible) else {
             return Ok(Some(Err(row.fault(self.time_column, "a time before the year 2100"))));
         };
+        if std::mem::take(&mut self.is_first_time_late) {
+            return Ok(Some(Err(row.fault(self.time_column, "before the times of the rows after it"))));
+        }
         let before = self.last_time.filter(|_| self.sections.is_none());
         if let (Some(before), Some(after)) =
             (before, after.and_then(|row| self.time.clone().parse(row.bytes(self.time_column).unwrap_or_default())))
@@ -259,7 +275,7 @@ impl CsvLog {
 }
 
 /// Allowed values of a field, for messages.
-const NUMBER: &str = "a finite number or an empty field";
+const NUMBER: &str = "a finite number, empty, - or n/a";
 
 /// The fault of a row whose current is a magnitude and whose state is unknown.
 fn unknown_state(sign: &CurrentSign, row: &Row<'_>, state: usize, current_a: f64) -> Option<TableError> {
@@ -276,6 +292,9 @@ fn open_table(source: Box<dyn Read>, path: &Path, options: &CsvOptions) -> Resul
     let file = path.display().to_string();
     let read = source.by_ref().take(4).read_to_end(&mut magic);
     read.map_err(|error| TableError::of_io(format!("{file}: cannot be read: {error}"), &error))?;
+    if magic.is_empty() {
+        return Err(TableError::Data(format!("{file}: is empty")));
+    }
     if is_parquet(&magic) {
         return open_parquet(path);
     }

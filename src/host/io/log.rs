@@ -310,7 +310,7 @@ impl LogSource {
             let found = String::from_utf8_lossy(first);
             return Err(LogError::Data(format!("{name}:1: found {found:?}, must be {:?}", journal::HEADER)));
         }
-        let csv = !journal && csv_log::is_table(path, after_remarks(lines.unread()));
+        let csv = !journal && csv_log::is_table(path, lines.unread());
         let form = if csv && !cfg!(feature = "formats") {
             let reason =
                 "is a table, and the vehicle's program reads only candump logs and journals; use the full program";
@@ -324,14 +324,4 @@ impl LogSource {
         };
         Ok(OpenLog { name, form })
     }
-}
-
-/// The first bytes of a log without the comments (`#`) at its beginning. A comment may contain commas, as tables do.
-fn after_remarks(mut head: &[u8]) -> &[u8] {
-    while head.starts_with(b"#")
-        && let Some(end) = memchr::memchr(b'\n', head)
-    {
-        head = &head[end + 1..];
-    }
-    head
 }

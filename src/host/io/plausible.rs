@@ -203,8 +203,13 @@ pub fn check_charge(time_s: &[f64], current_a: &[f64], capacity_ah: f64) -> Resu
     if span_ah <= MAX_CAPACITIES * capacity_ah {
         return Ok(());
     }
-    let what = format!("the current moves {span_ah:.0} Ah one way, but the rated capacity is {capacity_ah} Ah");
-    implausible("time", Some(probable_step_unit(median_step(time_s).unwrap_or_default())), what)
+    let what = format!(
+        "the current moves {span_ah:.0} Ah one way, but the rated capacity is {capacity_ah} Ah (it must include all \
+         parallel cells)"
+    );
+    // Rows are rarely less than 20 ms apart.
+    let probable = median_step(time_s).filter(|step_s| *step_s >= 20.0).map(probable_step_unit);
+    implausible("time", probable, what)
 }
 
 /// Checks that enough charge flows for the change of the mean voltage from one tenth of the rows to another. Only tenths

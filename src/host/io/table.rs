@@ -403,7 +403,7 @@ impl<'t> Row<'t> {
     /// # Errors
     /// Fails if the field is neither a finite number nor empty.
     pub fn number(&self, column: usize) -> Result<Option<f64>, TableError> {
-        self.number_in(column, f64::MIN..=f64::MAX, "a finite number or an empty field")
+        self.number_in(column, f64::MIN..=f64::MAX, "a finite number, empty, - or n/a")
     }
 
     /// A number in `range`; `None` for an empty field.
@@ -535,6 +535,10 @@ mod tests {
         assert_eq!(quoted.header().names(), ["a", "b, of c", "d"]);
         let row = quoted.next_row().expect("reads").expect("a row");
         assert_eq!((row.number(1), row.number(2), row.line), (Ok(Some(2.0)), Ok(Some(3.0)), 2));
+        let mut doubled = table("a,b,c\n\"note \"\"x\"\", y\",1,3.7\n", Quotes::Literal);
+        assert_eq!(doubled.next_row().expect("reads").expect("a row").number(2), Ok(Some(3.7)));
+        let open = "\"a,".repeat(200_000);
+        assert_eq!(text::join_quoted(&open.split(',').map(str::as_bytes).collect::<Vec<_>>(), b',').len(), 200_001);
         let mut table = table("a,b\n1,\"2\n3,\"4\"\n", Quotes::Literal);
         assert!(table.next_row().expect("reads").expect("a row").number(1).is_err());
         assert_eq!(table.next_row().expect("reads").expect("a row").number(1), Ok(Some(4.0)));

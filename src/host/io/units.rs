@@ -28,7 +28,8 @@ impl Quantity {
             Self::Current => "current",
             Self::Voltage => "voltage",
             Self::Temperature => "temperature",
-            Self::Charge | Self::Share => "another column",
+            Self::Charge => "charge",
+            Self::Share => "share",
         }
     }
 }

@@ -1,26 +1,14 @@
-//! Reads the daemon's stream socket and reconnects after a failure. Output: updates for the live view (`packwatch
-//! status --watch`).
+//! Reads the daemon's stream socket. Output: updates for the live view (`packwatch status --watch`).
 
-use std::io;
-use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::path::PathBuf;
 
-use tokio::io::AsyncReadExt;
-use tokio::net::UnixStream;
 use tokio::sync::mpsc;
-use tokio::time::{sleep, timeout};
 
 use super::app::FeedUpdate;
 use crate::io::clock::Reading;
 use crate::quantity::Timestamp;
-use crate::status::client::{check_length, explain, parse};
-use crate::status::stream_path;
-
-/// Pause before reconnecting.
-const RETRY: Duration = Duration::from_secs(1);
-/// Longest wait for data. After this time the connection is closed, because a suspended daemon keeps a connection open
-/// without sending.
-const SILENCE: Duration = Duration::from_secs(5);
+use crate::status::client::parse;
+use crate::status::stream::follow;
 
 /// The computer's clock.
 pub(super) fn now() -> Timestamp {
@@ -30,39 +18,20 @@ pub(super) fn now() -> Timestamp {
 /// Starts reading the stream socket next to the status socket at `path`. Errors name the status socket, as the options
 /// `--status` and `--socket` do.
 pub(super) fn start(path: PathBuf) -> mpsc::Receiver<FeedUpdate> {
-    // One update is drawn while the next is read.
+    // One update is drawn while the next is read. An update that arrives while both places are taken is dropped.
     let (updates, received) = mpsc::channel(1);
     tokio::spawn(async move {
-        loop {
-            let Err(error) = listen(&path, &updates).await else { return };
-            if updates.send(FeedUpdate::Lost(error)).await.is_err() {
-                return;
-            }
-            sleep(RETRY).await;
-        }
+        let handle = |line: Result<&[u8], &str>| {
+            let update = match line {
+                Ok(line) => FeedUpdate::StatusDocument(Box::new(parse(line)?)),
+                Err(error) => FeedUpdate::Lost(error.to_owned()),
+            };
+            let _ = updates.try_send(update);
+            Ok(())
+        };
+        follow(&path, "--socket", handle).await;
     });
     received
-}
-
-/// Reads until the connection fails (`Err`) or the view ends (`Ok`).
-async fn listen(path: &Path, updates: &mpsc::Sender<FeedUpdate>) -> Result<(), String> {
-    let failed = |error: io::Error| explain(path, "--socket", &error);
-    let mut stream = UnixStream::connect(stream_path(path)).await.map_err(failed)?;
-    let mut unread = Vec::new();
-    loop {
-        let read = timeout(SILENCE, stream.read_buf(&mut unread)).await;
-        if read.map_err(|late| failed(late.into()))?.map_err(failed)? == 0 {
-            return Err(failed(io::ErrorKind::UnexpectedEof.into()));
-        }
-        check_length(unread.len()).map_err(failed)?;
-        while let Some(end) = unread.iter().position(|byte| *byte == b'\n') {
-            let document = parse(&unread[..end])?;
-            unread.drain(..=end);
-            if updates.send(FeedUpdate::StatusDocument(Box::new(document))).await.is_err() {
-                return Ok(());
-            }
-        }
-    }
 }
 
 #[cfg(test)]
@@ -71,8 +40,8 @@ mod tests {
 
     #[tokio::test]
     async fn hint_without_daemon_names_status_socket() {
-        let (updates, _received) = mpsc::channel(1);
-        let said = listen(Path::new("/nonexistent/status.sock"), &updates).await.unwrap_err();
+        let update = start(PathBuf::from("/nonexistent/status.sock")).recv().await;
+        let Some(FeedUpdate::Lost(said)) = update else { panic!("{update:?}") };
         assert!(said.starts_with("/nonexistent/status.sock: no daemon listens there"), "{said}");
         assert!(
             said.contains("packwatch run -c FILE --status /nonexistent/status.sock"),

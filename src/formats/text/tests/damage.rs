@@ -107,7 +107,7 @@ fn large_times_and_backward_steps_are_kept() {
 fn time_of_day_beyond_any_clock_is_bad() {
     let head = "***BUSMASTER Ver 3.2.2***\n***START DATE AND TIME 14:11:2023 22:13:20:000***\n***SYSTEM MODE***\n";
     let log = format!("{head}{}", "2562046:00:00:0000 Rx 1 0x100 s 1 05\n".repeat(3));
-    assert!(frames(Format::Busmaster, log.as_bytes()).len() < 3, "no time is beyond the range of stamps");
+    assert!(frames(Format::Busmaster, log.as_bytes()).is_empty(), "no time is beyond the range of stamps");
 }
 
 #[test]

@@ -101,7 +101,7 @@ fn health(raw: &RawTables, pack: &Pack, rated_ah: f64) -> Option<HealthConfig> {
         recharge: raw.recharge.as_ref()?.config(rated_ah),
         end_of_life_ah: capacity.end_of_life * rated_ah,
         usable: raw.usable.as_ref().map(|keys| keys.config(rated_ah)),
-        outlook: raw.outlook.as_ref()?.config(raw.usable.as_ref().map(|keys| keys.config(rated_ah))),
+        outlook: raw.outlook.as_ref()?.config(raw.usable.as_ref().map(|keys| keys.config(rated_ah)), rated_ah),
     })
 }
 

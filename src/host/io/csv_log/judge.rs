@@ -21,6 +21,8 @@ pub(super) struct Judgement {
     pub(super) time_form: TimeForm,
     /// Whether the unit of time is a guess.
     pub(super) is_time_assumed: bool,
+    /// Whether the first time is after the times that follow, which are in order.
+    pub(super) is_first_time_late: bool,
     pub(super) sign: CurrentSign,
     /// Remarks for the user.
     pub(super) notes: Vec<String>,
@@ -119,10 +121,18 @@ impl Judge<'_> {
         if layout.section.is_none() {
             let size = PackSize { capacity_ah: self.options.capacity_ah };
             let response = plausible::check_response(&times, &currents, &self.samples.voltages, size);
-            response.map_err(|of| self.fault(layout, &of))?;
+            response.map_err(|mut of| {
+                if of.quantity == "time" {
+                    of.probable =
+                        (time_form == TimeForm::Number).then(|| self.other_time_unit(time.unit, false)).flatten();
+                }
+                self.fault(layout, &of)
+            })?;
         }
         self.compare_charge(layout, &times, &currents)?;
-        Ok(Judgement { time, time_form, is_time_assumed, sign, notes: self.notes })
+        let next = &times[times.len().min(1)..times.len().min(4)];
+        let is_first_time_late = next.len() > 1 && next.is_sorted() && next.iter().all(|time| *time < times[0]);
+        Ok(Judgement { time, time_form, is_time_assumed, is_first_time_late, sign, notes: self.notes })
     }
 
     /// The error for a column whose values are not in its unit.
@@ -258,8 +268,8 @@ impl Judge<'_> {
         if layout.section.is_none() {
             plausible::check_order(&times).map_err(|of| self.fault(layout, &of))?;
         }
-        if form == TimeForm::Number && layout.time.is_stated && unit.per_base() == 1.0 {
-            self.note_other_unit(layout, &times);
+        if form == TimeForm::Number && layout.time.is_stated {
+            self.note_other_unit(layout, unit, &times);
         }
         Ok((reader, form, is_assumed, times))
     }
@@ -281,19 +291,24 @@ impl Judge<'_> {
     fn unstated_time_unit(&self, layout: &Layout) -> (&'static Unit, bool) {
         let raw = &self.samples.raw_times;
         let find = |symbol: &str| Unit::find(symbol).unwrap_or(layout.time.unit);
-        let first = raw.iter().copied().find(|time| time.is_finite());
-        if let Some(unit) = first.and_then(plausible::probable_stamp_unit) {
+        let middle = median(raw);
+        if let Some(unit) = middle.and_then(plausible::probable_stamp_unit) {
             return (find(unit), false);
         }
-        let (Some(first), true) = (first, raw.len() > 2) else { return (layout.time.unit, true) };
-        if first > 1e8 {
+        let (Some(middle), true) = (middle, raw.len() > 2) else { return (layout.time.unit, true) };
+        if middle > 1e8 {
             // Seconds since 1970.
             return (layout.time.unit, false);
         }
-        let step = plausible::median_step(raw).unwrap_or_default();
+        // Several rows may have the same time in whole seconds.
+        let mut distinct = raw.clone();
+        distinct.dedup();
+        let step = plausible::median_step(&distinct).unwrap_or_default();
+        let days = find("Excel days");
         // From 1970 to 2100, with rows at most some minutes apart; as seconds, they would be less than 4 ms apart.
-        if (25_569.0..73_051.0).contains(&first) && step < 0.004 {
-            return (find("Excel days"), true);
+        if (25_569.0..73_051.0).contains(&middle) && step > 0.0 && step < 0.004 && self.is_possible_time_unit(raw, days)
+        {
+            return (days, true);
         }
         let by_charge = ["s", "min", "h", "ms", "us"]
             .into_iter()
@@ -339,20 +354,42 @@ impl Judge<'_> {
         (charge > 0.0 && stated > 0.0).then(|| charge / stated)
     }
 
-    /// Notes times that are stated in seconds but advance as minutes or hours do, or are too short for the voltages.
-    fn note_other_unit(&mut self, layout: &Layout, times: &[f64]) {
-        let name = &self.header.names()[layout.time.index];
-        let Samples { currents, voltages, .. } = &self.samples;
-        let slope = self.options.capacity_ah.map(|ah| plausible::check_slope(times, currents, voltages, ah));
-        let grid = grid_unit(times)
-            .filter(|unit| self.is_possible_time_unit(times, Unit::find(unit).unwrap_or(layout.time.unit)));
-        let (what, unit) = match (slope, grid) {
-            (Some(Err(of)), grid) => (of.what, grid.or(of.probable).unwrap_or("min")),
-            (_, Some(unit)) => (format!("advances like {unit}"), unit),
-            _ => return,
+    /// The unit closest to `unit`, longer or shorter, that the table allows with rows at least 20 ms apart.
+    fn other_time_unit(&self, unit: &Unit, is_longer: bool) -> Option<&'static str> {
+        let raw = &self.samples.raw_times;
+        let step = plausible::median_step(raw).unwrap_or_default();
+        let is_possible = |symbol: &&str| {
+            let other = Unit::find(symbol).unwrap_or(unit);
+            let ratio = unit.per_base() / other.per_base();
+            (if is_longer { ratio > 1.0 } else { ratio < 1.0 })
+                && other.convert(step) >= 0.02
+                && self.is_possible_time_unit(raw, other)
         };
+        let units = ["ns", "us", "ms", "s", "min", "h"];
+        if is_longer { units.into_iter().find(is_possible) } else { units.into_iter().rev().find(is_possible) }
+    }
+
+    /// Notes times that advance as those of a longer unit than the stated one do, or are too short for the voltages.
+    fn note_other_unit(&mut self, layout: &Layout, stated: &Unit, times: &[f64]) {
+        let Samples { currents, voltages, .. } = &self.samples;
+        let slope = self.options.capacity_ah.and_then(|ah| plausible::check_slope(times, currents, voltages, ah).err());
+        let raw = &self.samples.raw_times;
+        let grid = grid_unit(raw).filter(|unit| {
+            let unit = Unit::find(unit).unwrap_or(stated);
+            unit.per_base() < stated.per_base() && self.is_possible_time_unit(raw, unit)
+        });
+        let step_s = plausible::median_step(times).unwrap_or_default();
+        let is_short = stated.per_base() > 1.0 && step_s < 0.1 && self.options.capacity_ah.is_some();
+        let longer = || self.other_time_unit(stated, true);
+        let (what, unit) = match (slope, grid) {
+            (Some(of), grid) => (of.what, grid.or_else(longer).or(of.probable)),
+            (_, Some(unit)) => (format!("advances like {unit}"), Some(unit)),
+            _ => (format!("advances by {step_s} s per row"), longer().filter(|_| is_short)),
+        };
+        let (name, Some(unit)) = (&self.header.names()[layout.time.index], unit) else { return };
         self.notes.push(format!(
-            "column {name} {what}, but is read in s; if it is in {unit}, use --column time='{name}[{unit}]'"
+            "column {name} {what}, but is read in {}; if it is in {unit}, use --column time='{name}[{unit}]'",
+            stated.symbol
         ));
     }
 
@@ -428,7 +465,7 @@ impl Judge<'_> {
         };
         let [discharges, charges] = [Direction::Discharge, Direction::Charge].map(|direction| count(direction, true));
         // With charges and discharges of a positive current, single negative currents are faults of a magnitude.
-        let is_magnitude = charges > 0 && discharges > 0 && 100 * negative <= samples.currents.len();
+        let is_magnitude = negative < charges.min(discharges) && 100 * negative <= samples.currents.len();
         let is_never_negative = negative == 0 || is_magnitude;
         let codes = if is_never_negative { self.codes(layout, times) } else { Vec::new() };
         if is_never_negative && discharges + charges + codes.len() > 0 {
@@ -436,9 +473,17 @@ impl Judge<'_> {
             self.notes.extend(codes.iter().map(|(code, direction)| {
                 format!("state {} is a {direction:?} by the voltage", String::from_utf8_lossy(code)).to_lowercase()
             }));
-            let has_positive = [charges > 0 || !codes.is_empty(), discharges > 0 || !codes.is_empty()];
+            let [has_positive_charge, has_positive_discharge] =
+                [charges, discharges].map(|count| count > 0 || !codes.is_empty());
             let by_state = CurrentSign::new(true, SignSource::State);
-            return Ok(CurrentSign { is_by_state: true, has_positive, noise_a, codes, ..by_state });
+            return Ok(CurrentSign {
+                is_by_state: true,
+                has_positive_charge,
+                has_positive_discharge,
+                noise_a,
+                codes,
+                ..by_state
+            });
         }
         let samples = &self.samples;
         let shown = plausible::shown_sign(times, &samples.currents, &samples.voltages);

@@ -72,12 +72,16 @@ impl<'a> Columns<'a> {
         let name = |index: usize| header.names()[index].trim();
         let is_bare_t = |index: usize, of: &Known| of.unit.is_none() && name(index).eq_ignore_ascii_case("t");
         let has_time = known.iter().any(|(index, of)| group(of.role) == Role::Date && !is_bare_t(*index, of));
-        // `T` next to a time is a temperature, `t` is nothing; without another time, both are the time.
+        // If the table has another time, `T` is a temperature and `t` is not used. Otherwise, both are the time.
         let is_meant = |index: usize, of: &Known| match of.role {
             Role::Temperature => has_time && name(index) == "T",
             _ => !has_time,
         };
         known.retain(|(index, of)| !is_bare_t(*index, of) || is_meant(*index, of));
+        // In BioLogic's exports `Ewe` is the potential of one electrode, and `Ecell` the voltage.
+        let is = |index: usize, words: &str| ColumnName::parse(name(index), "").words == words;
+        let has_ecell = known.iter().any(|(index, _)| is(*index, "ecell"));
+        known.retain(|(index, _)| !has_ecell || !is(*index, "ewe"));
         Self { header, options, format: Format::of(header.names()), known }
     }
 
@@ -124,7 +128,8 @@ impl<'a> Columns<'a> {
     fn unknown_units(&self) -> impl Iterator<Item = (&'a String, Role, String)> {
         let unit = |index: usize| self.header.unit_text(index);
         let names = self.header.names().iter().enumerate();
-        names.filter_map(move |(index, name)| unknown_unit(name, unit(index)).map(|(role, unit)| (name, role, unit)))
+        let unread = names.filter(|(index, _)| !self.known.iter().any(|(of, _)| of == index));
+        unread.filter_map(move |(index, name)| unknown_unit(name, unit(index)).map(|(role, unit)| (name, role, unit)))
     }
 
     fn mapped(&self, role: &str) -> Option<&'a str> {

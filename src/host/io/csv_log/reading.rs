@@ -112,7 +112,7 @@ fn time(header: &Header, layout: &Layout, judgement: &Judgement) -> String {
     let (number, name) = (layout.time.index + 1, quoted(header, layout.time.index));
     let assumed = match judgement.is_time_assumed {
         true => {
-            format!(" (assumed; if it is another, use --column time='{}[UNIT]')", header.names()[layout.time.index])
+            format!(" (assumed, --column time='{}[UNIT]' changes it)", header.names()[layout.time.index])
         }
         false => String::new(),
     };

@@ -12,20 +12,32 @@ pub(super) enum Direction {
 }
 
 /// Parts of words for a discharge, without accents.
-const DISCHARGE: &str = "disch dsch dch dsg dech entlad ontlad utlad urlad aflad descarg scaric rozlad \
+const DISCHARGE: &str = "disch dsg entlad ontlad utlad urlad aflad descarg scaric rozlad \
     \u{440}\u{430}\u{437}\u{440}\u{44f}\u{434} \u{653e}\u{7535} \u{653e}\u{96fb}";
+/// Beginnings of words for a discharge. Elsewhere they may be of two words: `gridcharging`.
+const DISCHARGE_START: [&str; 3] = ["dch", "dsch", "dech"];
 /// Parts of words for a charge.
 const CHARGE: &str = "charg chrg chg regen lade ladu ladd ladn ladi ladow carga caric \
     \u{437}\u{430}\u{440}\u{44f}\u{434} \u{5145}\u{7535} \u{5145}\u{96fb}";
 /// Words for no current.
-const REST: &str = "r p s o rest resting pau pause pse idle standby ocv ocp wait waiting ruhe relax repos stop stopped open off end ready \
+const REST: &str = "r p s o rest resting pau pause pse idle stand standby ocv ocp wait waiting ruhe relax repos stop stopped open off end ready \
     full float finished none \u{9759}\u{7f6e} \u{6401}\u{7f6e} \u{4f11}\u{6b62}";
 /// Words that negate the others.
 const NEGATION: &str = "not no non nicht kein keine without";
 
 /// The words of a state in lower case, without accents.
 fn words(state: &[u8]) -> Vec<String> {
-    let text = String::from_utf8_lossy(state).to_lowercase().replace("notch", "not ch").replace("notd", "not d");
+    let mut text = String::new();
+    let (state, mut last) = (String::from_utf8_lossy(state), ' ');
+    let mut chars = state.chars().peekable();
+    while let Some(c) = chars.next() {
+        if last.is_lowercase() && c.is_uppercase() && chars.peek().is_some_and(|next| next.is_alphabetic()) {
+            text.push(' ');
+        }
+        text.push(c);
+        last = c;
+    }
+    let text = text.to_lowercase().replace("notch", "not ch").replace("notd", "not d");
     let plain = text.chars().map(|c| match c {
         '\u{e8}'..='\u{eb}' => 'e',
         '\u{e0}'..='\u{e5}' => 'a',
@@ -49,9 +61,14 @@ pub(super) fn direction(state: &[u8]) -> Option<Direction> {
     let is = |list: &str| words.iter().any(|word| list.split(' ').any(|of| of == word));
     let has = |parts: &str| words.iter().any(|word| parts.split(' ').any(|part| word.contains(part)));
     let is_divided = words.windows(2).any(|pair| ["d", "dis", "de"].contains(&&*pair[0]) && pair[1].starts_with("ch"));
+    // `CC`, `CV`, `CP` and `CR` may precede the word.
+    let bare = |word: &String| word.trim_start_matches(|c: char| c.is_ascii_digit() || "cvpr".contains(c)).to_owned();
+    let is_begun = words.iter().map(bare).any(|word| DISCHARGE_START.iter().any(|start| word.starts_with(start)));
     match () {
         () if is(NEGATION) => None,
-        () if is("d dis ent") || is_divided || has(DISCHARGE) => Some(Direction::Discharge),
+        () if is("d dis ent") || is_divided || is_begun || has(DISCHARGE) => Some(Direction::Discharge),
+        // `PULSEDCHG` and `GRIDCHG` cannot be told apart.
+        () if has("dchg dchrg") => None,
         () if is("c ch cha lad") || has(CHARGE) => Some(Direction::Charge),
         () => None,
     }
@@ -73,9 +90,10 @@ pub(super) struct CurrentSign {
     pub(super) is_charge_positive: bool,
     /// Whether the current is a magnitude whose sign the state column gives.
     pub(super) is_by_state: bool,
-    /// Whether charges and discharges with a positive current have occurred. Both together show a magnitude.
-    pub(super) has_positive: [bool; 2],
-    /// Largest current that counts as none (A).
+    /// Whether a charge with a positive current has occurred. With a discharge of this kind, it shows a magnitude.
+    pub(super) has_positive_charge: bool,
+    pub(super) has_positive_discharge: bool,
+    /// Currents up to this size are noise of a current of zero (A).
     pub(super) noise_a: f64,
     /// Directions of states that are numbers.
     pub(super) codes: Vec<(Vec<u8>, Direction)>,
@@ -84,8 +102,15 @@ pub(super) struct CurrentSign {
 
 impl CurrentSign {
     pub(super) fn new(is_charge_positive: bool, source: SignSource) -> Self {
-        let has_positive = [false; 2];
-        Self { is_charge_positive, is_by_state: false, has_positive, noise_a: 0.0, codes: Vec::new(), source }
+        Self {
+            is_charge_positive,
+            is_by_state: false,
+            has_positive_charge: false,
+            has_positive_discharge: false,
+            noise_a: 0.0,
+            codes: Vec::new(),
+            source,
+        }
     }
 
     /// The direction of a state.
@@ -99,15 +124,17 @@ impl CurrentSign {
             let Some(direction) = direction else { return (value.abs() <= self.noise_a).then_some(value) };
             let is_discharge = direction == Direction::Discharge;
             if value >= -self.noise_a {
-                self.has_positive[usize::from(is_discharge)] |= value > self.noise_a;
+                self.has_positive_charge |= !is_discharge && value > self.noise_a;
+                self.has_positive_discharge |= is_discharge && value > self.noise_a;
                 return Some(if is_discharge { value } else { -value });
             }
-            if self.has_positive == [true; 2] {
+            if self.has_positive_charge && self.has_positive_discharge {
                 return None;
             }
             // The first negative current shows a sign, which the one-sided rows before it could not show.
             self.is_by_state = false;
-            self.is_charge_positive = if is_discharge { !self.has_positive[1] } else { self.has_positive[0] };
+            self.is_charge_positive =
+                if is_discharge { !self.has_positive_discharge } else { self.has_positive_charge };
         }
         let discharge_a = if self.is_charge_positive { -value } else { value };
         // A discharge in the state of a charge contradicts the sign that a single negative current has shown.
@@ -149,12 +176,15 @@ mod tests {
             }
         };
         all(
-            "DISCH,DSG,Dischrg,D\u{e9}charge,Entladen,DIS-CHG,CCDChg,D_CC,Dis Charge,descarga,dsch",
+            "DISCH,DSG,Dischrg,D\u{e9}charge,Entladen,DIS-CHG,CCDChg,D_CC,Dis Charge,descarga,dsch,PulseDChg,CCCVDCHG,DisCharge",
             Some(Direction::Discharge),
         );
-        all("CHG,Chrg,Charge,Laden,C_CC,Mid-charge,2nd charge,Regen,Carga,CC-CV Cha", Some(Direction::Charge));
-        all("Not charging,NotCharging,No discharge,Idle,Unknown,OK,1,change,Channel", None);
-        assert!(["Not charging", "Rest", "PAU", "Idle", "R"].iter().all(|text| is_rest(text.as_bytes())));
+        all(
+            "GridCharging,ScheduledCharging,TimedCharge,gridcharging,ModeCharging,CHG,Chrg,Charge,Laden,C_CC,Mid-charge,2nd charge,Regen,Carga,CC-CV Cha",
+            Some(Direction::Charge),
+        );
+        all("PULSEDCHG,SoC,Not charging,NotCharging,No discharge,Idle,Unknown,OK,1,change,Channel", None);
+        assert!(["Not charging", "StandBy", "Rest", "PAU", "Idle", "R"].iter().all(|text| is_rest(text.as_bytes())));
         assert!(["CC", "Driving", "1", ""].iter().all(|text| !is_rest(text.as_bytes())));
     }
 }

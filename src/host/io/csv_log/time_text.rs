@@ -44,26 +44,20 @@ impl TimeText {
     }
 
     /// Whether dates begin with the day, and whether this is a guess: the order that makes the record shorter, or the
-    /// month.
+    /// month. If the orders can read different dates, the order that can read more dates is used.
     pub(super) fn is_day_first(texts: &[impl AsRef<str>]) -> (bool, bool) {
-        let texts = || texts.iter().map(|text| text.as_ref().trim().trim_matches('"'));
-        let numbers = |text: &str| {
-            let mut numbers = text.split(['/', '-', ' ']).map(|part| part.parse::<u32>().unwrap_or(0));
-            (numbers.next().unwrap_or(0), numbers.next().unwrap_or(0))
-        };
-        if texts().any(|text| (13..=31).contains(&numbers(text).0)) {
-            return (true, false);
+        let read = |text: &str| [true, false].map(|is_day_first| stamp::parse_date(text, is_day_first));
+        let dates: Vec<[Option<Timestamp>; 2]> =
+            texts.iter().map(|text| read(text.as_ref().trim().trim_matches('"'))).collect();
+        let [day, month] = [0, 1].map(|order| dates.iter().filter(|of| of[order].is_some()).count());
+        if day != month || dates.iter().all(|of| of[0] == of[1]) {
+            return (day > month, false);
         }
-        let is_open = |(first, second): (u32, u32)| (1..13).contains(&first) && (1..13).contains(&second);
-        if !texts().all(|text| is_open(numbers(text))) {
-            return (false, false);
-        }
-        let span = |is_day_first: bool| {
-            let times: Vec<i64> =
-                texts().filter_map(|text| stamp::parse_date(text, is_day_first)).map(Timestamp::nanos).collect();
-            times.iter().max().zip(times.iter().min()).map(|(last, first)| last - first)
-        };
-        (span(true) < span(false), true)
+        let [day, month] = [0, 1].map(|order| {
+            let times = || dates.iter().filter_map(|of| of[order]).map(Timestamp::nanos);
+            times().max().zip(times().min()).map(|(last, first)| last.saturating_sub(first))
+        });
+        (day < month, true)
     }
 
     /// Reads a time. Returns `None` if the text is none.

@@ -330,7 +330,7 @@ impl ReadState {
                 Ok(None) => return Ok(None),
                 Ok(Some(row)) => row,
                 Err(error) => {
-                    self.bad(|| error.to_string())?;
+                    self.bad(|| format!("{error}; the rest of the file is not read"))?;
                     return Ok(None);
                 }
             };

@@ -172,22 +172,23 @@ fn split(line: &[u8], separator: u8) -> Vec<String> {
     join_quoted(&parts, separator).into_iter().map(text).collect()
 }
 
-/// Whether a part of a line is the beginning of a quoted field that holds separators.
+/// Whether a part of a line is the beginning of a quoted field that holds separators. Quotes within it are doubled.
 pub(super) fn opens_quote(part: &[u8]) -> bool {
-    let part = part.trim_ascii();
-    part.starts_with(b"\"") && (part.len() == 1 || !part.ends_with(b"\""))
+    part.trim_ascii_start().starts_with(b"\"") && has_odd_quotes(part)
+}
+
+fn has_odd_quotes(part: &[u8]) -> bool {
+    memchr::memchr_iter(b'"', part).count() % 2 == 1
 }
 
 /// Joins the parts of quoted fields that hold separators. A quote without an end stays.
 pub(super) fn join_quoted(parts: &[&[u8]], separator: u8) -> Vec<Vec<u8>> {
-    let closes = |part: &[u8]| {
-        let part = part.trim_ascii();
-        part.ends_with(b"\"") && (part.len() == 1 || !part.starts_with(b"\""))
-    };
     let mut fields = Vec::new();
     let mut rest = parts;
     while let [first, after @ ..] = rest {
-        let end = opens_quote(first).then(|| after.iter().position(|part| closes(part))).flatten();
+        // The search ends before the next part that opens a quote, so its time is linear.
+        let end = opens_quote(first).then(|| after.iter().position(|part| has_odd_quotes(part))).flatten();
+        let end = end.filter(|&end| after[end].trim_ascii_end().ends_with(b"\""));
         let (field, after) = rest.split_at(end.map_or(1, |end| end + 2));
         fields.push(field.join(&separator));
         rest = after;

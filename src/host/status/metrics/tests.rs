@@ -5,7 +5,7 @@ use std::process::{Command, Stdio};
 
 use super::super::sample::sample;
 use super::*;
-use crate::quantity::catalogue::Quantity;
+use crate::quantity::catalogue::{Quantity, TABLE};
 
 /// The samples of a metric family, as written.
 fn samples<'a>(text: &'a str, name: &str) -> Vec<&'a str> {
@@ -90,4 +90,23 @@ fn promtool_accepts_metrics() {
     }
     let (is_good, said) = promtool("# TYPE bad_total gauge\nbad_total 1\n").unwrap();
     assert!(!is_good && !said.is_empty(), "promtool must report a bad name");
+}
+
+#[test]
+fn dashboard_and_rules_use_existing_metrics() {
+    let mut document = sample(2);
+    for row in &TABLE {
+        document.pack.values.set(row.quantity, Some((0.5, 0.1)));
+        document.cells[0].values.set(row.quantity, Some((0.5, 0.1)));
+    }
+    let text = openmetrics(Some(document));
+    let known: HashSet<&str> = text.lines().filter_map(|line| line.split(['{', ' ']).next()).collect();
+    for file in [
+        include_str!("../../../../config/grafana/packwatch.json"),
+        include_str!("../../../../config/prometheus/packwatch.rules.yml"),
+    ] {
+        let words = file.split(|letter: char| !letter.is_ascii_alphanumeric() && letter != '_');
+        let names: HashSet<&str> = words.filter(|word| word.starts_with("packwatch_")).collect();
+        assert!(names.len() > 5 && names.is_subset(&known), "{:?}", names.difference(&known));
+    }
 }

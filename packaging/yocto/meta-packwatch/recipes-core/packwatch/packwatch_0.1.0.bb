@@ -37,12 +37,15 @@ cargo_do_compile:prepend() {
 }
 
 do_install:append() {
-    install -d ${D}${sysconfdir}/packwatch/cells ${D}${datadir}/packwatch/cells ${D}${systemd_system_unitdir}
+    install -d ${D}${sysconfdir}/packwatch/cells ${D}${datadir}/packwatch/cells ${D}${systemd_system_unitdir} \
+        ${D}${datadir}/packwatch/grafana ${D}${datadir}/packwatch/prometheus
     install -m 0644 ${S}/config/example.toml ${D}${sysconfdir}/packwatch/packwatch.toml
     install -m 0644 ${S}/config/pack96.dbc ${D}${sysconfdir}/packwatch/
     install -m 0644 ${S}/config/cells/example_nmc_2600.toml ${D}${sysconfdir}/packwatch/cells/
     install -m 0644 ${S}/config/packwatch.dbc ${D}${datadir}/packwatch/
     install -m 0644 ${S}/config/cells/*.toml ${D}${datadir}/packwatch/cells/
+    install -m 0644 ${S}/config/grafana/packwatch.json ${D}${datadir}/packwatch/grafana/
+    install -m 0644 ${S}/config/prometheus/packwatch.rules.yml ${D}${datadir}/packwatch/prometheus/
     install -m 0644 ${S}/systemd/packwatch.service ${S}/systemd/packwatch@.service ${S}/systemd/packwatch-exporter.service \
         ${D}${systemd_system_unitdir}/
 }

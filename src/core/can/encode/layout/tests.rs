@@ -236,13 +236,12 @@ fn ah_steps_fit_rated_capacity() {
     assert_eq!(steps(280.0), [0.1, 0.01, 0.005]);
     assert_eq!(steps(1000.0), [0.5, 0.05, 0.01]);
     assert_eq!(steps(100_000.0), [50.0, 5.0, 1.0]);
-    let made = layout(
-        LayoutBase::BuiltIn(RatedPack { capacity_ah: 120.0, energy_wh: 64_000.0 }),
-        &LayoutSettings::default(),
-    );
+    let made =
+        layout(LayoutBase::BuiltIn(RatedPack { capacity_ah: 120.0, energy_wh: 64_000.0 }), &LayoutSettings::default());
     let made = made.unwrap();
     let step = |name: &str| made.signal(&format!("PACKWATCH_Health.{name}")).unwrap().1.layout.factor;
-    let steps = ["RemainingEnergy", "EnergyToFull", "RemainingEnergyStd", "DischargePower2s", "ChargePower30s"].map(step);
+    let steps =
+        ["RemainingEnergy", "EnergyToFull", "RemainingEnergyStd", "DischargePower2s", "ChargePower30s"].map(step);
     assert_eq!(steps, [0.002, 0.002, 0.01, 0.1, 0.1]);
 }
 

@@ -299,7 +299,7 @@ section! {
 
 section! {
     /// Limits for the remaining energy, the times to empty and to full, and the power.
-    Outlook at "outlook" gives OutlookConfig, |keys, usable: Option<UsableConfig>| {
+    Outlook at "outlook" gives OutlookConfig, |keys, usable: Option<UsableConfig>, rated_ah: f64| {
         /// Lowest voltage of a cell under load.
         min_voltage_v: Option<f64>, "V", Above(0.0, 100.0), Optional("`cutoff_v` of `[usable]`, else the cell model's lowest voltage")
             => min_voltage_v: keys.min_voltage_v.or(usable.map(|usable| usable.cutoff_v));
@@ -310,7 +310,8 @@ section! {
         /// Largest charging current, per cell.
         max_charge_a: Option<f64>, "A", Above(0.0, 1e6), Optional("only the voltages limit the current");
         /// A charge is complete when its current, per cell, has dropped to this value at the highest voltage.
-        taper_current_a: Option<f64>, "A", Above(0.0, 1e6), Optional("the current at the end of the last charge that tapered off; before it, C/20");
+        taper_current_a: Option<f64>, "A", Above(0.0, 1e6), Optional("`taper_current_a` of `[usable]`, else C/20: the rated capacity over 20 h")
+            => taper_current_a: keys.taper_current_a.or(usable.map(|usable| usable.taper_current_a)).unwrap_or(rated_ah / 20.0);
         /// State of charge for which the time of a charge is stated.
         target_soc: f64, "fraction", Between(0.0, 1.0), Default("0.8");
     }
