@@ -24,12 +24,10 @@ use crate::quantity::{CellIndex, InvalidState, Mode, Timestamp};
 pub const POWER_S: [f64; 3] = [2.0, 10.0, 30.0];
 /// Time over which the load of a discharge is averaged (s). Over half an hour, fast and slow parts of a drive mix.
 const LOAD_S: f64 = 1800.0;
-/// A charge of at least this time counts (s). Braking ends sooner. A longer gap without a current is not averaged.
-const LEAST_CHARGE_S: f64 = 600.0;
-/// A charge tapers off when its current has fallen to this share of its strongest current.
-const TAPERED: f64 = 0.8;
-/// Standard deviation of the voltage at which a charger holds the fullest cell, relative to the model (V).
-const CHARGER_STD_V: f64 = 0.02;
+/// Standard deviation of ln(time that the charger holds the voltage). Models without a slow branch taper too fast.
+const LOG_HELD_STD: f64 = 0.7;
+/// A longer gap without a current is not averaged (s).
+const GAP_S: f64 = 600.0;
 /// Standard deviation of ln(future load over recent load): a driver needs a third more or less in the next half hour.
 const LOG_LOAD_STD: f64 = 0.3;
 /// Time over which the current of a charge is averaged (s). A charger regulates its current.
@@ -69,11 +67,6 @@ pub struct RecentLoad {
     latest: Option<Timestamp>,
     discharge: Average,
     charge: Average,
-    /// Time and largest mean current of the charge in progress.
-    charging_s: f64,
-    strongest_a: f64,
-    /// Highest voltage of a cell while a charge tapers off (V).
-    held_v: Option<f64>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
@@ -113,35 +106,13 @@ impl RecentLoad {
     pub fn observe(&mut self, now: Timestamp, mode: Mode, current_a: Option<f64>, rest_a: f64) {
         let seconds = self.latest.map_or(0.0, |latest| now.since(latest));
         self.latest = Some(now);
-        let Some(current_a) = current_a.filter(|_| seconds > 0.0 && seconds <= LEAST_CHARGE_S) else { return };
+        let Some(current_a) = current_a.filter(|_| seconds > 0.0 && seconds <= GAP_S) else { return };
         match mode {
-            Mode::Charge => {
-                self.charge.add(-current_a, seconds, CHARGER_S);
-                self.charging_s += seconds;
-                self.strongest_a = self.strongest_a.max(self.charge.mean_a);
-            }
-            Mode::Rest if current_a.abs() <= rest_a => {
-                (self.charge, self.charging_s, self.strongest_a) = (Average::default(), 0.0, 0.0);
-            }
+            Mode::Charge => self.charge.add(-current_a, seconds, CHARGER_S),
+            Mode::Rest if current_a.abs() <= rest_a => self.charge = Average::default(),
             // A load that changes its direction within seconds has no mode, but is a load.
             Mode::Discharge | Mode::Rest | Mode::Unknown => self.discharge.add(current_a, seconds, LOAD_S),
         }
-    }
-
-    /// Whether the charger reduces its current. Braking ends sooner.
-    pub fn is_tapering(&self, mode: Mode) -> bool {
-        mode == Mode::Charge && self.charging_s >= LEAST_CHARGE_S && self.charge.mean_a < TAPERED * self.strongest_a
-    }
-
-    /// Notes the highest voltage of a cell (V) while the charger reduces its current.
-    pub fn note_held(&mut self, highest_v: f64) {
-        let held_v = self.held_v.unwrap_or(highest_v);
-        self.held_v = Some(held_v + 0.1 * (highest_v - held_v));
-    }
-
-    /// The limits, with the voltage that the last charge has shown if none is set.
-    fn learned(&self, config: &OutlookConfig) -> OutlookConfig {
-        OutlookConfig { max_voltage_v: config.max_voltage_v.or(self.held_v), ..*config }
     }
 
     /// The charger's current (A, positive), if the pack is being charged.
@@ -163,9 +134,7 @@ impl RecentLoad {
             InvalidState::unless_natural("the time of an averaged current", average.seconds)?;
             InvalidState::unless_natural("the mean square of a current", average.mean_square_a2)?;
             InvalidState::unless_numbers("a mean or largest current", [average.mean_a, average.peak_a])
-        })?;
-        let held_v = self.held_v.unwrap_or(0.0);
-        InvalidState::unless_naturals("a value of a charge", [held_v, self.charging_s, self.strongest_a])
+        })
     }
 }
 
@@ -248,8 +217,8 @@ impl CellState<'_> {
     /// Voltage (V) at a load: the mean, and the lowest at the largest current.
     fn loaded_v(&self, soc: f64, load: &Load) -> (f64, f64) {
         let (ocv_v, settled_ohm) = (self.ocv_v(soc), self.ohm(soc, f64::INFINITY));
-        let fast_ohm = self.ohm(soc, POWER_S[1]);
-        (ocv_v - load.loss_v(settled_ohm, fast_ohm), ocv_v - load.peak_v(settled_ohm, fast_ohm))
+        let [peak_ohm, fast_ohm, _] = POWER_S.map(|after_s| self.ohm(soc, after_s));
+        (ocv_v - load.loss_v(settled_ohm, fast_ohm), ocv_v - load.peak_v(settled_ohm, peak_ohm))
     }
 
     /// SOC at which the voltage at the largest current of the load falls to the lowest voltage.
@@ -461,7 +430,6 @@ pub fn of_pack(
     pack: &Structure,
 ) -> Option<Outlook> {
     let rated_ah = cells.first()?.model.rated_capacity_ah;
-    let config = &load.learned(config);
     let discharge = load.discharge.load();
     let drawn = discharge.unwrap_or(Load::usual(rated_ah));
     let charger_a = load.charger_a(mode).unwrap_or(USUAL_LOAD_PER_H * rated_ah);
@@ -487,12 +455,11 @@ pub fn of_pack(
         ScalarGaussian { mean: per_ah_s * charge.mean, variance }
     });
     let target_soc = fullest.soc.mean + (config.target_soc - pack.soc) * pack.capacity_ah / fullest.capacity.mean;
-    let charging = |value: &dyn Fn(&CellState<'_>, &OutlookConfig) -> f64| {
-        let held_v = config.max_voltage_v.unwrap_or(fullest.model.voltage_max_v);
-        let at = |change_v| value(fullest, &OutlookConfig { max_voltage_v: Some(held_v + change_v), ..*config });
-        let by_charger_s = 0.5 * (at(CHARGER_STD_V) - at(-CHARGER_STD_V));
-        let time_s = fullest.spread(|cell| value(cell, config));
-        load.charger_a(mode).map(|_| ScalarGaussian { variance: time_s.variance + square(by_charger_s), ..time_s })
+    let charging = |charge_ah: &dyn Fn(&CellState<'_>) -> f64| {
+        let time_s = fullest.spread(|cell| cell.charging_s(charge_ah(cell), charger_a, config));
+        let held_s = time_s.mean - 3600.0 * charge_ah(fullest) / charger_a;
+        let variance = time_s.variance + square(LOG_HELD_STD * held_s);
+        load.charger_a(mode).map(|_| ScalarGaussian { variance, ..time_s })
     };
     let power = |direction, for_s| {
         let limits = cells.iter().map(|cell| cell.limit_a(direction, for_s, config)).enumerate();
@@ -510,10 +477,10 @@ pub fn of_pack(
         remaining_wh: whole(energy, &|cell| cell.delivered_wh(drawn_ah, &drawn)),
         to_full_wh: whole(to_full, &|cell| cell.taken_wh(taken_ah, charger_a, config)),
         to_empty_s,
-        to_full_s: charging(&|cell, config| cell.charging_s(cell.chargeable_ah(config), charger_a, config)),
-        to_target_s: charging(&|cell, config| {
+        to_full_s: charging(&|cell| cell.chargeable_ah(config)),
+        to_target_s: charging(&|cell| {
             let charge_ah = (target_soc - cell.soc.mean) * cell.capacity.mean;
-            cell.charging_s(charge_ah.clamp(0.0, cell.chargeable_ah(config)), charger_a, config)
+            charge_ah.clamp(0.0, cell.chargeable_ah(config))
         }),
         discharge_w: discharge.0,
         charge_w: charge.0,
@@ -524,7 +491,6 @@ pub fn of_pack(
 /// Computes the outlook of one cell, regardless of the other cells.
 pub fn of_cell(config: &OutlookConfig, load: &RecentLoad, cell: &CellState<'_>) -> CellOutlook {
     let drawn = load.discharge.load().unwrap_or(Load::usual(cell.model.rated_capacity_ah));
-    let config = &load.learned(config);
     let power = |direction| {
         let limit = cell.limit_a(direction, POWER_S[1], config);
         let voltage_v = cell.voltage_after(direction, limit.mean, POWER_S[1]);

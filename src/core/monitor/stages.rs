@@ -227,11 +227,6 @@ impl Stages {
         let rest_a = config.transition.dead_band_a / strings;
         let mode = state.detector.mode();
         state.load.observe(now, mode, current_a.map(|pack_a| pack_a / strings), rest_a);
-        if state.load.is_tapering(mode)
-            && let Some(highest_v) = self.sampling.sampler.highest_voltage_v(now)
-        {
-            state.load.note_held(highest_v);
-        }
         if observed.change.is_none() && !observed.candidate_begins {
             return;
         }

@@ -442,13 +442,6 @@ impl Sampler {
         oldest.is_some_and(|oldest| now.since(oldest) <= self.config.voltage.max_age_s)
     }
 
-    /// Highest voltage of a cell (V); `None` unless all voltages are fresh.
-    pub fn highest_voltage_v(&self, now: Timestamp) -> Option<f64> {
-        let first = 1 + self.sensors;
-        let voltages = self.state.signals[first..first + self.voltages].iter();
-        voltages.map(|signal| signal.fresh(now, &self.config.voltage)).try_fold(f64::MIN, |most, v| Some(most.max(v?)))
-    }
-
     /// Whether any signal that the estimates use is bad or stale.
     pub fn any_bad(&self) -> bool {
         self.any_lost() && self.state.signals[..1 + self.sensors + self.voltages].iter().any(Signal::is_bad)

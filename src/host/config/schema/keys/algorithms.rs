@@ -304,7 +304,7 @@ section! {
         min_voltage_v: Option<f64>, "V", Above(0.0, 100.0), Optional("`cutoff_v` of `[usable]`, else the cell model's lowest voltage")
             => min_voltage_v: keys.min_voltage_v.or(usable.map(|usable| usable.cutoff_v));
         /// Highest voltage of a cell under charge.
-        max_voltage_v: Option<f64>, "V", Above(0.0, 100.0), Optional("the voltage at which the last charge tapered off; before it, the cell model's highest voltage");
+        max_voltage_v: Option<f64>, "V", Above(0.0, 100.0), Optional("the cell model's highest voltage");
         /// Largest discharge current, per cell.
         max_discharge_a: Option<f64>, "A", Above(0.0, 1e6), Optional("only the voltages limit the current");
         /// Largest charging current, per cell.
