@@ -453,13 +453,7 @@ impl Stages {
             self.sending.send_status(now, &fields, out);
         }
         if is_health_due {
-            let outlook = if out.ignores_frames { None } else { self.outlook() };
-            let energy_soh = outlook.and_then(|_| self.energy_soh()).map(|soh| soh.mean);
-            let fields = HealthFields {
-                outlook: outlook.as_ref().map(|outlook| outlook::fields(outlook, energy_soh)).unwrap_or_default(),
-                model_state: Some(self.modelling.view().state.code()),
-                ..self.learning.health_fields(&self.estimation.bank)
-            };
+            let fields = if out.ignores_frames { HealthFields::default() } else { self.health_fields() };
             self.sending.send_health(now, &fields, out);
         }
         if is_alarm_due {
@@ -482,6 +476,15 @@ impl Stages {
             Validity::Degraded
         } else {
             Validity::Valid
+        }
+    }
+
+    fn health_fields(&self) -> HealthFields {
+        let energy_soh = self.energy_soh().map(|soh| soh.mean);
+        HealthFields {
+            outlook: self.outlook().map(|outlook| outlook::fields(&outlook, energy_soh)).unwrap_or_default(),
+            model_state: Some(self.modelling.view().state.code()),
+            ..self.learning.health_fields(&self.estimation.bank)
         }
     }
 
