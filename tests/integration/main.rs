@@ -66,6 +66,8 @@ mod monitor_scenarios;
 mod monitor_statistics;
 mod on_board_model;
 mod other_cell;
+#[cfg(feature = "lab")]
+mod outlook_measured;
 mod output_dbc;
 mod pack_memory;
 mod pack_modules;
