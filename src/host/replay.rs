@@ -251,8 +251,7 @@ impl Replay {
             write_estimates_header(file)?;
         }
         let want_estimates = sinks.estimates.is_some() || sinks.watch.is_some() || sinks.outputs.is_some();
-        let ignores_frames = sinks.frames.is_none() && sinks.outputs.is_none() && !settings.snapshot;
-        let out = Outputs { want_estimates, ignores_frames, ..Outputs::default() };
+        let out = Outputs { want_estimates, ..Outputs::default() };
         Ok(Self {
             monitor,
             out,
@@ -380,7 +379,7 @@ impl Replay {
                 event_log::write_line(file, event)?;
             }
         }
-        self.summary.frames_out += out.frames.len() as u64 + std::mem::take(&mut out.ignored_frames);
+        self.summary.frames_out += out.frames.len() as u64;
         if let Some(file) = &mut self.sinks.frames {
             let interfaces = &self.settings.interfaces;
             out.frames.iter().try_for_each(|transmit| write_frame(file, interfaces, transmit))?;

@@ -11,8 +11,8 @@ use packwatch::can::dbc::{Database, Repetition};
 use packwatch::can::e2e::{Profile, Protection};
 use packwatch::can::encode::{
     AlarmFields, Command, CommandFields, CommandPlan, CommandRefusal, DigestFields, E2eSetting, HealthFields,
-    LayoutBase, LayoutSettings, MessageSettings, OutlookFields, OutputPlan, RatedPack, ReplyFields, RuleState,
-    SendCounters, StatusFields, TableChecksum, ThresholdFields, layout,
+    LayoutBase, LayoutSettings, MessageSettings, OutputPlan, ReplyFields, RuleState, SendCounters, StatusFields,
+    TableChecksum, ThresholdFields, layout,
 };
 use packwatch::can::secoc::{self, Authentication};
 use packwatch::can::{CanId, Frame, FrameKind};
@@ -108,12 +108,8 @@ impl Case {
             reply: self.message(6),
             freshness: MessageSettings::default(),
         };
-        layout(LayoutBase::BuiltIn(rated(self.rated_capacity_ah)), &settings).unwrap()
+        layout(LayoutBase::BuiltIn { rated_capacity_ah: self.rated_capacity_ah }, &settings).unwrap()
     }
-}
-
-fn rated(capacity_ah: f64) -> RatedPack {
-    RatedPack { capacity_ah, energy_wh: 3.7 * capacity_ah }
 }
 
 /// Values that a receiver must read: name, value in the DBC's unit, and tolerance (half a step).
@@ -194,22 +190,6 @@ impl Maker {
         let (usable, usable_std, ratio) = (self.below(largest_ah), self.below(largest_ah / 4.0), self.below(4.0));
         let (cycles, cycles_low, days) = (self.below(60_000.0), self.below(60_000.0), self.below(8_000.0));
         let losses = [(); 3].map(|()| [self.below(1.0), self.below(0.3)]);
-        let energy_wh = rated(self.rated_capacity_ah).energy_wh;
-        let [remaining, std_wh, to_full] = [2.0, 0.5, 2.0].map(|share| self.below(share * energy_wh));
-        let times = [(); 3].map(|()| self.below(160_000.0));
-        let powers = [(); 6].map(|()| self.below(20.0 * energy_wh));
-        let (energy_soh, cells) = (self.below(2.0), [(); 2].map(|()| self.one_of(1024)));
-        let outlook = OutlookFields {
-            remaining_wh: [remaining, std_wh].map(Some),
-            to_full_wh: Some(to_full),
-            energy_soh: Some(energy_soh),
-            to_empty_s: Some(times[0]),
-            to_full_s: Some(times[1]),
-            to_target_s: Some(times[2]),
-            discharge_w: [powers[0], powers[1], powers[2]].map(Some),
-            charge_w: [powers[3], powers[4], powers[5]].map(Some),
-            limiting_cells: Some(cells.map(|cell| CellIndex(u16::try_from(cell).unwrap()))),
-        };
         let fields = HealthFields {
             capacity_ah: Some(capacity),
             capacity_std_ah: Some(std),
@@ -226,7 +206,6 @@ impl Maker {
             lam_ne: losses[1].map(Some),
             lam_pe: losses[2].map(Some),
             model_state: Some(2),
-            outlook,
         };
         let mut wanted = match page {
             0 => self.wanted("Health", &[("Capacity", capacity), ("CapacityStd", std), ("Soh", 100.0 * soh)]),
@@ -237,31 +216,6 @@ impl Maker {
             2 => self.wanted(
                 "Health",
                 &[("UsableCapacity", usable), ("UsableCapacityStd", usable_std), ("ResistanceRatio", 100.0 * ratio)],
-            ),
-            5 => self.wanted(
-                "Health",
-                &[
-                    ("RemainingEnergy", remaining / 1000.0),
-                    ("RemainingEnergyStd", std_wh / 1000.0),
-                    ("EnergyToFull", to_full / 1000.0),
-                ],
-            ),
-            6 => self
-                .wanted("Health", &[("TimeToEmpty", times[0]), ("TimeToFull", times[1]), ("TimeToTarget", times[2])]),
-            7 | 8 => {
-                let kind = if page == 7 { "Discharge" } else { "Charge" };
-                let names = ["2s", "10s", "30s"].map(|time| format!("{kind}Power{time}"));
-                let values = names.iter().zip(&powers[3 * (page - 7)..]);
-                let values: Vec<_> = values.map(|(name, watts)| (name.as_str(), watts / 1000.0)).collect();
-                self.wanted("Health", &values)
-            }
-            9 => self.wanted(
-                "Health",
-                &[
-                    ("EnergySoh", 100.0 * energy_soh),
-                    ("DischargeLimitingCell", f64::from(cells[0])),
-                    ("ChargeLimitingCell", f64::from(cells[1])),
-                ],
             ),
             4 => self.wanted(
                 "Health",
@@ -609,7 +563,7 @@ fn contract_table() -> impl Iterator<Item = Vec<&'static str>> {
 /// Compares with the manual's contract page: `/docs/src/ecu/contract.md`, "Messages" and "Budget".
 #[test]
 fn dbc_timing_matches_contract_page() {
-    let base = LayoutBase::BuiltIn(rated(2.6));
+    let base = LayoutBase::BuiltIn { rated_capacity_ah: 2.6 };
     // Replies are sent if commands are accepted, freshness values if commands are authenticated.
     let secoc = |profile, data_id| Some(Authentication { profile, data_id });
     let command = MessageSettings { secoc: secoc(secoc::Profile::P1, 1), ..MessageSettings::default() };

@@ -19,10 +19,9 @@ pub use digest::{DigestFields, RuleState, TableChecksum, ThresholdFields};
 pub use input::InputEncoder;
 pub use layout::{
     ALARM_DELAY_MS, CHANGE_REPETITION_MS, CHANGE_REPETITIONS, DEFAULT_PERIOD_MS, E2eSetting, FRESHNESS_PERIOD_MS,
-    LayoutBase, LayoutMessage, LayoutSettings, MessageSettings, REPLY_DELAY_MS, RatedPack, SettingFault,
-    default_database, layout,
+    LayoutBase, LayoutMessage, LayoutSettings, MessageSettings, REPLY_DELAY_MS, SettingFault, default_database, layout,
 };
 pub use message::PlanFaults;
-pub use output::{AlarmFields, HealthFields, OutlookFields, OutputPlan, SendCounters, SentMessage, StatusFields};
+pub use output::{AlarmFields, HealthFields, OutputPlan, SendCounters, SentMessage, StatusFields};
 pub use protector::InputProtector;
 pub use reply::{CommandRefusal, ReplyFields};

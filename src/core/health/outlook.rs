@@ -1,8 +1,7 @@
 //! Outlook: energy, time and power that a pack can deliver or take up from now on.
 //!
 //! In: state and model of every cell ([`CellState`]), the recent load ([`RecentLoad`]) and the limits
-//! ([`OutlookConfig`]). Out: [`Outlook`] of the pack and [`CellOutlook`] of a cell, with variances. Currents are per
-//! cell, positive = discharge.
+//! ([`OutlookConfig`]). Out: [`Outlook`] of the pack, with variances. Currents are per cell, positive = discharge.
 //!
 //! * All cells of a series pack carry the same charge. A discharge ends when the first cell is empty, a charge when the
 //!   first cell is full. Energy is the integral of the cells' voltages over that charge, less the losses at the recent
@@ -39,7 +38,7 @@ const HALVINGS: u32 = 12;
 /// Steps of the search for the current at a voltage limit. The SOC moves by less than 1 % in 30 s at 1C.
 const CURRENT_STEPS: u32 = 4;
 /// Number of intervals of an integral over the charge.
-const INTERVALS: u32 = 16;
+const INTERVALS: u32 = 8;
 /// Number of steps of a charge.
 const CHARGE_STEPS: u32 = 64;
 
@@ -377,17 +376,6 @@ fn mean_of(value: impl Fn(f64) -> f64) -> f64 {
     (0..INTERVALS).map(|k| value(middle(k))).sum::<f64>() / f64::from(INTERVALS)
 }
 
-/// What a cell alone can deliver and take up.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct CellOutlook {
-    /// Energy until the cell is empty, at the recent load (Wh).
-    pub remaining_wh: ScalarGaussian,
-    /// Power of a discharge for 10 s (W).
-    pub discharge_w: ScalarGaussian,
-    /// Power of a charge for 10 s (W).
-    pub charge_w: ScalarGaussian,
-}
-
 /// What the pack can deliver and take up.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Outlook {
@@ -433,12 +421,11 @@ pub fn of_pack(
     let discharge = load.discharge.load();
     let drawn = discharge.unwrap_or(Load::usual(rated_ah));
     let charger_a = load.charger_a(mode).unwrap_or(USUAL_LOAD_PER_H * rated_ah);
-    let least = |charge_ah: &dyn Fn(&CellState<'_>) -> f64| {
-        let charges = cells.iter().map(|cell| (charge_ah(cell), cell));
-        charges.min_by(|a, b| a.0.total_cmp(&b.0))
+    let least = |value: &dyn Fn(&CellState<'_>) -> f64| {
+        cells.iter().map(|cell| (value(cell), cell)).min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, cell)| cell)
     };
-    let (drawn_ah, weakest) = least(&|cell| cell.dischargeable_ah(&drawn, config))?;
-    let (taken_ah, fullest) = least(&|cell| cell.chargeable_ah(config))?;
+    let weakest = least(&|cell| cell.soc.mean * cell.capacity.mean)?;
+    let fullest = least(&|cell| (1.0 - cell.soc.mean) * cell.capacity.mean)?;
     let sum = |value: &dyn Fn(&CellState<'_>) -> f64| {
         pack.strings * pack.series_per_state * cells.iter().map(value).sum::<f64>()
     };
@@ -447,12 +434,13 @@ pub fn of_pack(
         mean: sum(value),
         variance: square(sum(&|_| 1.0)) * one.variance,
     };
-    let [charge, energy] = weakest.remaining(&drawn, config);
+    let [drawn_ah, energy] = weakest.remaining(&drawn, config);
+    let taken_ah = fullest.chargeable_ah(config);
     let to_full = fullest.spread(|cell| cell.taken_wh(cell.chargeable_ah(config), charger_a, config));
     let to_empty_s = discharge.filter(|_| mode == Mode::Discharge).map(|load| {
         let per_ah_s = 3600.0 / load.mean_a;
-        let variance = square(per_ah_s) * charge.variance + square(per_ah_s * charge.mean * LOG_LOAD_STD);
-        ScalarGaussian { mean: per_ah_s * charge.mean, variance }
+        let variance = square(per_ah_s) * drawn_ah.variance + square(per_ah_s * drawn_ah.mean * LOG_LOAD_STD);
+        ScalarGaussian { mean: per_ah_s * drawn_ah.mean, variance }
     });
     let target_soc = fullest.soc.mean + (config.target_soc - pack.soc) * pack.capacity_ah / fullest.capacity.mean;
     let charging = |charge_ah: &dyn Fn(&CellState<'_>) -> f64| {
@@ -461,20 +449,19 @@ pub fn of_pack(
         let variance = time_s.variance + square(LOG_HELD_STD * held_s);
         load.charger_a(mode).map(|_| ScalarGaussian { variance, ..time_s })
     };
-    let power = |direction, for_s| {
-        let limits = cells.iter().map(|cell| cell.limit_a(direction, for_s, config)).enumerate();
-        let (index, limit) = limits.min_by(|a, b| a.1.mean.total_cmp(&b.1.mean))?;
-        let voltage_v = sum(&|cell| cell.voltage_after(direction, limit.mean, for_s));
-        let power = ScalarGaussian { mean: limit.mean * voltage_v, variance: square(voltage_v) * limit.variance };
-        Some((power, CellIndex(u16::try_from(index).unwrap_or(u16::MAX))))
-    };
     let powers = |direction| {
-        let [short, middle, long] = POWER_S.map(|for_s| power(direction, for_s));
-        Some(([short?.0, middle?.0, long?.0], middle?.1))
+        let limits = cells.iter().map(|cell| cell.limit_a(direction, POWER_S[1], config).mean).enumerate();
+        let (index, _) = limits.min_by(|a, b| a.1.total_cmp(&b.1))?;
+        let powers = POWER_S.map(|for_s| {
+            let limit = cells[index].limit_a(direction, for_s, config);
+            let voltage_v = sum(&|cell| cell.voltage_after(direction, limit.mean, for_s));
+            ScalarGaussian { mean: limit.mean * voltage_v, variance: square(voltage_v) * limit.variance }
+        });
+        Some((powers, CellIndex(u16::try_from(index).unwrap_or(u16::MAX))))
     };
     let (discharge, charge) = (powers(Direction::Discharge)?, powers(Direction::Charge)?);
     Some(Outlook {
-        remaining_wh: whole(energy, &|cell| cell.delivered_wh(drawn_ah, &drawn)),
+        remaining_wh: whole(energy, &|cell| cell.delivered_wh(drawn_ah.mean, &drawn)),
         to_full_wh: whole(to_full, &|cell| cell.taken_wh(taken_ah, charger_a, config)),
         to_empty_s,
         to_full_s: charging(&|cell| cell.chargeable_ah(config)),
@@ -486,18 +473,6 @@ pub fn of_pack(
         charge_w: charge.0,
         limiting_cells: [discharge.1, charge.1],
     })
-}
-
-/// Computes the outlook of one cell, regardless of the other cells.
-pub fn of_cell(config: &OutlookConfig, load: &RecentLoad, cell: &CellState<'_>) -> CellOutlook {
-    let drawn = load.discharge.load().unwrap_or(Load::usual(cell.model.rated_capacity_ah));
-    let power = |direction| {
-        let limit = cell.limit_a(direction, POWER_S[1], config);
-        let voltage_v = cell.voltage_after(direction, limit.mean, POWER_S[1]);
-        ScalarGaussian { mean: limit.mean * voltage_v, variance: square(voltage_v) * limit.variance }
-    };
-    let [_, remaining_wh] = cell.remaining(&drawn, config);
-    CellOutlook { remaining_wh, discharge_w: power(Direction::Discharge), charge_w: power(Direction::Charge) }
 }
 
 /// Energy of the full cell relative to a new cell of the rated capacity, both discharged in five hours.

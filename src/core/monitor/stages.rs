@@ -453,7 +453,10 @@ impl Stages {
             self.sending.send_status(now, &fields, out);
         }
         if is_health_due {
-            let fields = if out.ignores_frames { HealthFields::default() } else { self.health_fields() };
+            let fields = HealthFields {
+                model_state: Some(self.modelling.view().state.code()),
+                ..self.learning.health_fields(&self.estimation.bank)
+            };
             self.sending.send_health(now, &fields, out);
         }
         if is_alarm_due {
@@ -476,15 +479,6 @@ impl Stages {
             Validity::Degraded
         } else {
             Validity::Valid
-        }
-    }
-
-    fn health_fields(&self) -> HealthFields {
-        let energy_soh = self.energy_soh().map(|soh| soh.mean);
-        HealthFields {
-            outlook: self.outlook().map(|outlook| outlook::fields(&outlook, energy_soh)).unwrap_or_default(),
-            model_state: Some(self.modelling.view().state.code()),
-            ..self.learning.health_fields(&self.estimation.bank)
         }
     }
 

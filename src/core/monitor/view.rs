@@ -17,7 +17,7 @@ use crate::can::poll::PollSilence;
 use crate::cell::LossModes;
 use crate::cell_faults::{CellFault, Difference};
 use crate::filter::ScalarGaussian;
-use crate::health::outlook::{self, Outlook};
+use crate::health::outlook::Outlook;
 use crate::health::{InsufficientData, PackState, RemainingLife};
 use crate::quantity::catalogue::{CellValues, Estimate, PackValues, Quantity, RECORDED, Values};
 use crate::quantity::{BusIndex, CellIndex, Channel, Mode, Timestamp};
@@ -247,12 +247,6 @@ impl Monitor {
         values.set(Quantity::ResistanceRatio, soc.map(|_| resistance));
         set_losses(&mut values, self.loss_modes(cell));
         set_remaining_life(&mut values, life.ok());
-        if let Some(state) = soc.and_then(|_| self.stages.cell_state(cell.index())) {
-            let outlook = outlook::of_cell(&learning.config.outlook, &learning.state.load, &state);
-            values.set(Quantity::RemainingEnergy, Some(outlook.remaining_wh));
-            values.set(Quantity::DischargePower10s, Some(outlook.discharge_w));
-            values.set(Quantity::ChargePower10s, Some(outlook.charge_w));
-        }
         CellView {
             cell,
             values,

@@ -369,8 +369,7 @@ pub static TABLE: [QuantityRow; 35] = [
         "Energy until the first cell is empty, at the recent load",
         ("remaining_energy", "Remaining Energy"),
         Standard("StateOfCharge.CurrentEnergy"),
-    )
-    .cell("Energy until the cell is empty, at the recent load", None, Overlay("Cells.RemainingEnergy")),
+    ),
     Row::estimate(Q::EnergyToFull, ("energy_to_full_wh", "energy_to_full_std_wh"), Unit::WattHours, "energy_to_full")
         .pack(
             "Energy that the pack takes up until the first cell is full",
@@ -407,8 +406,7 @@ pub static TABLE: [QuantityRow; 35] = [
             "Power that can be drawn for 10 s within the limits of every cell",
             ("discharge_power_10s", "Discharge Power 10 s"),
             Overlay("Power.Discharge10s"),
-        )
-        .cell("Power that can be drawn for 10 s", None, Overlay("Cells.DischargePower10s")),
+        ),
     Row::power(Q::DischargePower30s, ("discharge_power_30s_w", "discharge_power_30s_std_w"), "discharge_power_30s")
         .pack(
             "Power that can be drawn for 30 s within the limits of every cell",
@@ -420,13 +418,11 @@ pub static TABLE: [QuantityRow; 35] = [
         ("charge_power_2s", "Charge Power 2 s"),
         Overlay("Power.Charge2s"),
     ),
-    Row::power(Q::ChargePower10s, ("charge_power_10s_w", "charge_power_10s_std_w"), "charge_power_10s")
-        .pack(
-            "Power that can be charged for 10 s within the limits of every cell",
-            ("charge_power_10s", "Charge Power 10 s"),
-            Overlay("Power.Charge10s"),
-        )
-        .cell("Power that can be charged for 10 s", None, Overlay("Cells.ChargePower10s")),
+    Row::power(Q::ChargePower10s, ("charge_power_10s_w", "charge_power_10s_std_w"), "charge_power_10s").pack(
+        "Power that can be charged for 10 s within the limits of every cell",
+        ("charge_power_10s", "Charge Power 10 s"),
+        Overlay("Power.Charge10s"),
+    ),
     Row::power(Q::ChargePower30s, ("charge_power_30s_w", "charge_power_30s_std_w"), "charge_power_30s").pack(
         "Power that can be charged for 30 s within the limits of every cell",
         ("charge_power_30s", "Charge Power 30 s"),

@@ -177,14 +177,11 @@ fn signal(message: &Message, name: &str, faults: &mut Vec<String>) -> Option<(Si
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::can::encode::{LayoutBase, LayoutSettings, MessageSettings, RatedPack, layout};
+    use crate::can::encode::{LayoutBase, LayoutSettings, MessageSettings, layout};
 
     fn plan() -> CommandPlan {
         let settings = LayoutSettings { command: Some(MessageSettings::default()), ..Default::default() };
-        CommandPlan::new(
-            &layout(LayoutBase::BuiltIn(RatedPack { capacity_ah: 2.6, energy_wh: 9.6 }), &settings).unwrap(),
-        )
-        .unwrap()
+        CommandPlan::new(&layout(LayoutBase::BuiltIn { rated_capacity_ah: 2.6 }, &settings).unwrap()).unwrap()
     }
 
     /// Codes of command, rule, severity and cell in a frame.

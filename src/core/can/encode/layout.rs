@@ -8,7 +8,7 @@
 //!
 //! The built-in base is adapted:
 //!
-//! * The steps of capacities, energies and powers grow with the pack.
+//! * The steps of Ah signals grow with the cell's capacity.
 //! * The header of profile 5 is one byte longer than the reserved space, so all signals move up by a byte.
 //! * An authenticated message grows by its trailer.
 //! * An authenticated command omits the header's bytes.
@@ -159,19 +159,13 @@ pub struct MessageSettings {
 /// Base of a layout.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum LayoutBase<'d> {
-    /// The shipped DBC, adapted to the pack.
-    BuiltIn(RatedPack),
+    /// The shipped DBC, adapted to a cell of this rated capacity (Ah).
+    BuiltIn {
+        /// Rated capacity (Ah).
+        rated_capacity_ah: f64,
+    },
     /// The user's own DBC, which is not adapted.
     Own(&'d Database),
-}
-
-/// Size of the pack, to which the steps of the shipped DBC are adapted.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct RatedPack {
-    /// Rated capacity of a cell (Ah).
-    pub capacity_ah: f64,
-    /// Energy of all cells at their rated capacity (Wh).
-    pub energy_wh: f64,
 }
 
 /// Settings of all messages.
@@ -221,8 +215,8 @@ pub struct SettingFault {
 /// # Errors
 /// All settings that do not fit.
 pub fn layout(base: LayoutBase<'_>, settings: &LayoutSettings) -> Result<Database, Vec<SettingFault>> {
-    let (database, rated) = match base {
-        LayoutBase::BuiltIn(rated) => (shipped(), Some(rated)),
+    let (database, rated_capacity_ah) = match base {
+        LayoutBase::BuiltIn { rated_capacity_ah } => (shipped(), Some(rated_capacity_ah)),
         LayoutBase::Own(database) => (database, None),
     };
     let mut faults = Vec::new();
@@ -230,14 +224,14 @@ pub fn layout(base: LayoutBase<'_>, settings: &LayoutSettings) -> Result<Databas
     for which in LayoutMessage::ALL {
         if let (Some(settings), Some(message)) = (settings.of(which), database.message(which.message())) {
             let mut laid_out = message.clone();
-            if let Some(rated) = &rated {
-                fit_steps(&mut laid_out, rated);
+            if let Some(rated_capacity_ah) = rated_capacity_ah {
+                fit_steps(&mut laid_out, rated_capacity_ah);
             }
             let mut note = |key, what: String| faults.push(SettingFault { message: which, key, what });
-            if rated.is_some() && settings.secoc.is_some() && which == LayoutMessage::Command {
+            if rated_capacity_ah.is_some() && settings.secoc.is_some() && which == LayoutMessage::Command {
                 move_down(&mut laid_out);
             }
-            apply(&mut laid_out, settings, rated.is_some(), &mut note);
+            apply(&mut laid_out, settings, rated_capacity_ah.is_some(), &mut note);
             if which.is_cyclic() {
                 laid_out.cycle_time_ms = laid_out.cycle_time_ms.or(Some(DEFAULT_PERIOD_MS));
             }
@@ -469,22 +463,15 @@ fn check_trailer(message: &Message, authentication: Authentication, fault: &mut 
     }
 }
 
-/// Adapts the steps of capacities, energies and powers: multiplies the built-in step by the smallest factor of 1, 2, 5,
-/// 10, ... with which the largest possible value fits. The largest capacity and energy are twice the rated ones. The
-/// largest power discharges the rated energy in three minutes. Of standard deviations, half of the rated value fits.
-fn fit_steps(message: &mut Message, rated: &RatedPack) {
-    let energy_kwh = rated.energy_wh / 1000.0;
-    let kinds = [
-        ("Ah", false, 2.0 * rated.capacity_ah),
-        ("Ah", true, 0.5 * rated.capacity_ah),
-        ("kWh", false, 2.0 * energy_kwh),
-        ("kWh", true, 0.5 * energy_kwh),
-        ("kW", false, 20.0 * energy_kwh),
-    ];
-    for (unit, is_std, largest) in kinds {
-        let belongs = |signal: &Signal| signal.unit == unit && signal.name.ends_with("Std") == is_std;
+/// Adapts the steps of Ah signals: multiplies the built-in step by the smallest factor of 1, 2, 5, 10, ... with which
+/// the largest possible value fits. The largest possible value is twice the rated capacity; for a standard deviation,
+/// it is half of the rated capacity.
+fn fit_steps(message: &mut Message, rated_capacity_ah: f64) {
+    let largest_ah = |signal: &Signal| rated_capacity_ah * if signal.name.ends_with("Std") { 0.5 } else { 2.0 };
+    for is_std in [false, true] {
+        let belongs = |signal: &Signal| signal.unit == "Ah" && signal.name.ends_with("Std") == is_std;
         let needed = message.signals.iter().filter(|signal| belongs(signal));
-        let needed = needed.map(|signal| times(largest / signal.layout.maximum)).fold(1.0, f64::max);
+        let needed = needed.map(|signal| times(largest_ah(signal) / signal.layout.maximum)).fold(1.0, f64::max);
         for signal in message.signals.iter_mut().filter(|signal| belongs(signal)) {
             signal.layout.factor = decimal(signal.layout.factor * needed);
             signal.layout.maximum = decimal(signal.layout.maximum * needed);

@@ -228,11 +228,7 @@ impl OutputField {
             place: None,
             plan,
             not_available: signal.not_available_codes().first().copied().unwrap_or(customary),
-            per_inside_unit: match signal.unit.as_str() {
-                "%" | "%/d" => 100.0,
-                "kW" | "kWh" => 1e-3,
-                _ => 1.0,
-            },
+            per_inside_unit: if matches!(signal.unit.as_str(), "%" | "%/d") { 100.0 } else { 1.0 },
             pages,
             is_multiplexor: signal.is_multiplexor,
         })

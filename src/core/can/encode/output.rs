@@ -36,7 +36,7 @@ const STATUS: SignalTable<StatusFields, 8> = [
 ];
 
 /// Signals of the health frame, on any page; the first [`HEALTH_REQUIRED`] are required.
-const HEALTH: SignalTable<HealthFields, 33> = [
+const HEALTH: SignalTable<HealthFields, 18> = [
     ("Capacity", |f| f.capacity_ah),
     ("CapacityStd", |f| f.capacity_std_ah),
     ("Soh", |f| f.soh),
@@ -55,21 +55,6 @@ const HEALTH: SignalTable<HealthFields, 33> = [
     ("LamPe", |f| f.lam_pe[0]),
     ("LamPeStd", |f| f.lam_pe[1]),
     ("ModelState", |f| f.model_state.map(f64::from)),
-    ("RemainingEnergy", |f| f.outlook.remaining_wh[0]),
-    ("RemainingEnergyStd", |f| f.outlook.remaining_wh[1]),
-    ("EnergyToFull", |f| f.outlook.to_full_wh),
-    ("EnergySoh", |f| f.outlook.energy_soh),
-    ("TimeToEmpty", |f| f.outlook.to_empty_s),
-    ("TimeToFull", |f| f.outlook.to_full_s),
-    ("TimeToTarget", |f| f.outlook.to_target_s),
-    ("DischargePower2s", |f| f.outlook.discharge_w[0]),
-    ("DischargePower10s", |f| f.outlook.discharge_w[1]),
-    ("DischargePower30s", |f| f.outlook.discharge_w[2]),
-    ("ChargePower2s", |f| f.outlook.charge_w[0]),
-    ("ChargePower10s", |f| f.outlook.charge_w[1]),
-    ("ChargePower30s", |f| f.outlook.charge_w[2]),
-    ("DischargeLimitingCell", |f| f.outlook.limiting_cells.map(|cells| cells[0].0.into())),
-    ("ChargeLimitingCell", |f| f.outlook.limiting_cells.map(|cells| cells[1].0.into())),
 ];
 const HEALTH_REQUIRED: usize = 8;
 
@@ -132,31 +117,6 @@ pub struct HealthFields {
     pub lam_pe: [Option<f64>; 2],
     /// Wire code that says how well the cells' model is known.
     pub model_state: Option<u8>,
-    /// Energy, time and power.
-    pub outlook: OutlookFields,
-}
-
-/// Energy, time and power in the health frame; `None` = not available.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct OutlookFields {
-    /// Energy until the pack is empty, and its standard deviation (Wh).
-    pub remaining_wh: [Option<f64>; 2],
-    /// Energy until the pack is full (Wh).
-    pub to_full_wh: Option<f64>,
-    /// State of health by energy, fraction.
-    pub energy_soh: Option<f64>,
-    /// Time until the pack is empty (s).
-    pub to_empty_s: Option<f64>,
-    /// Time until the pack is full (s).
-    pub to_full_s: Option<f64>,
-    /// Time until the configured state of charge (s).
-    pub to_target_s: Option<f64>,
-    /// Power of a discharge for 2, 10 and 30 s (W): 5 % quantile.
-    pub discharge_w: [Option<f64>; 3],
-    /// Power of a charge for 2, 10 and 30 s (W): 5 % quantile.
-    pub charge_w: [Option<f64>; 3],
-    /// The cells that limit the power of a discharge and of a charge.
-    pub limiting_cells: Option<[CellIndex; 2]>,
 }
 
 /// Contents of one alarm frame.

@@ -31,9 +31,13 @@ fn loaded(mode: Mode, current_a: f64) -> RecentLoad {
     load
 }
 
-fn of_one(cell: CellState<'_>, (mode, current_a): (Mode, f64)) -> Outlook {
+fn of_one(cell: CellState<'_>, load: (Mode, f64)) -> Outlook {
+    limited(cell, load, &CONFIG)
+}
+
+fn limited(cell: CellState<'_>, (mode, current_a): (Mode, f64), config: &OutlookConfig) -> Outlook {
     let pack = Structure { series_per_state: 1.0, strings: 1.0, soc: cell.soc.mean, capacity_ah: cell.capacity.mean };
-    of_pack(&CONFIG, (&loaded(mode, current_a), mode), &[cell], &pack).unwrap()
+    of_pack(config, (&loaded(mode, current_a), mode), &[cell], &pack).unwrap()
 }
 
 /// The circuit at 0 degrees C, simulated in steps of 0.1 s.
@@ -115,14 +119,14 @@ fn power_reaches_limit_of_voltage_or_current() {
             near(steps.last().unwrap(), limit_v, 0.005);
         }
     }
-    let limited = OutlookConfig { max_discharge_a: Some(2.0), max_charge_a: Some(1.0), ..CONFIG };
-    let cell = of_cell(&limited, &RecentLoad::default(), &cell(&model, 0.5));
+    let config = OutlookConfig { max_discharge_a: Some(2.0), max_charge_a: Some(1.0), ..CONFIG };
+    let outlook = limited(cell(&model, 0.5), (Mode::Rest, 0.0), &config);
     let drop = |current_a: f64| {
         let mut circuit = Circuit { model: &model, soc: 0.5, branch_v: 0.0 };
         (0..100).map(|_| circuit.step(current_a)).last().unwrap()
     };
-    near(cell.discharge_w.mean, 2.0 * drop(2.0), 0.001);
-    near(cell.charge_w.mean, drop(-1.0), 0.001);
+    near(outlook.discharge_w[1].mean, 2.0 * drop(2.0), 0.001);
+    near(outlook.charge_w[1].mean, drop(-1.0), 0.001);
 }
 
 #[test]

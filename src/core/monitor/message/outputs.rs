@@ -114,10 +114,6 @@ pub struct Outputs {
     pub estimates: Vec<Estimate>,
     /// Whether the caller wants `estimates`.
     pub want_estimates: bool,
-    /// Whether nobody reads the frames. Health frames are then counted and not made.
-    pub ignores_frames: bool,
-    /// Number of frames that were counted and not made.
-    pub ignored_frames: u64,
     /// Inputs of the alarm engine; empty unless `want_alarm_inputs` is set. Not included: restored alarms and changed
     /// rules.
     pub alarm_inputs: Vec<(Timestamp, AlarmInput)>,

@@ -454,7 +454,7 @@ impl Learning {
             lli: part(|losses| &losses.lithium),
             lam_ne: part(|losses| &losses.negative),
             lam_pe: part(|losses| &losses.positive),
-            ..HealthFields::default()
+            model_state: None,
         }
     }
 }

@@ -336,12 +336,7 @@ impl Sending {
 
     /// Sends all pages of the health frame.
     pub(crate) fn send_health(&mut self, now: Timestamp, fields: &HealthFields, out: &mut Outputs) {
-        let Some(output) = &self.config else { return };
-        let pages = output.plan.health_pages();
-        if out.ignores_frames {
-            out.ignored_frames += (pages * buses_of(output, None).count()) as u64;
-            return;
-        }
+        let pages = self.config.as_ref().map_or(0, |output| output.plan.health_pages());
         for page in 0..pages {
             self.send(now, LayoutMessage::Health, out, |plan, counters| Some(plan.health(page, fields, counters)));
         }

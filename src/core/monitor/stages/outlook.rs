@@ -1,8 +1,7 @@
 //! Energy, time and power of the pack and its cells, from the states of the stages. They are computed on demand, for a
-//! view or a frame.
+//! view.
 
 use super::Stages;
-use crate::can::encode::OutlookFields;
 use crate::filter::ScalarGaussian;
 use crate::health::outlook::{CellState, Outlook, Structure, energy_health, of_pack};
 use crate::sample::VoltageSource;
@@ -42,23 +41,5 @@ impl Stages {
             branch_v: estimator.branch_v(),
             temperature_c: bank.temperature_c(index)?,
         })
-    }
-}
-
-/// The fields of the health frame. A receiver that uses the whole stated power keeps the limits in 95 % of all cases.
-pub(super) fn fields(outlook: &Outlook, energy_soh: Option<f64>) -> OutlookFields {
-    let mean = |value: Option<ScalarGaussian>| value.map(|value| value.mean);
-    // 95 % is at 1.645 standard deviations.
-    let low = |power: ScalarGaussian| Some((power.mean - 1.645 * power.std()).max(0.0));
-    OutlookFields {
-        remaining_wh: [outlook.remaining_wh.mean, outlook.remaining_wh.std()].map(Some),
-        to_full_wh: Some(outlook.to_full_wh.mean),
-        energy_soh,
-        to_empty_s: mean(outlook.to_empty_s),
-        to_full_s: mean(outlook.to_full_s),
-        to_target_s: mean(outlook.to_target_s),
-        discharge_w: outlook.discharge_w.map(low),
-        charge_w: outlook.charge_w.map(low),
-        limiting_cells: Some(outlook.limiting_cells),
     }
 }

@@ -12,7 +12,7 @@ use crate::can::CanId;
 use crate::can::dbc::{Database, FrameFormat};
 use crate::can::e2e::Protection;
 use crate::can::encode::{
-    DEFAULT_PERIOD_MS, E2eSetting, LayoutBase, LayoutMessage, LayoutSettings, MessageSettings, OutputPlan, RatedPack,
+    DEFAULT_PERIOD_MS, E2eSetting, LayoutBase, LayoutMessage, LayoutSettings, MessageSettings, OutputPlan,
     SettingFault, layout,
 };
 use crate::can::secoc::{self, Authentication};
@@ -71,10 +71,8 @@ pub(crate) fn output(
     };
     // If the cell model is missing, this fault is already reported. Any capacity is then good enough to find further
     // faults of the layout.
-    let (capacity_ah, cell_v) = (raw.rated_ah(model).unwrap_or(1.0), model.map_or(1.0, |model| model.voltage_max_v));
-    let cells = raw.pack.as_ref().map_or(1.0, |pack| f64::from(pack.cells) * f64::from(pack.strings));
-    let rated = RatedPack { capacity_ah, energy_wh: cells * capacity_ah * cell_v };
-    let base = own.as_ref().map_or(LayoutBase::BuiltIn(rated), LayoutBase::Own);
+    let rated_capacity_ah = raw.rated_ah(model).unwrap_or(1.0);
+    let base = own.as_ref().map_or(LayoutBase::BuiltIn { rated_capacity_ah }, LayoutBase::Own);
     let refuse = |fault: &SettingFault| {
         if let Some(frame) = keys_of(&laid_out, fault.message) {
             frame.place.fault(fault.key, &fault.what);

@@ -5,7 +5,7 @@ use proptest::prelude::*;
 use super::*;
 use crate::can::dbc::Repetition;
 use crate::can::e2e::{Profile, Protection};
-use crate::can::encode::{LayoutBase, LayoutSettings, MessageSettings, RatedPack, default_database, layout};
+use crate::can::encode::{LayoutBase, LayoutSettings, MessageSettings, default_database, layout};
 use crate::can::secoc::{self, Authentication};
 use crate::can::signal::SignalLayout;
 
@@ -14,7 +14,7 @@ const SHIPPED: &str = include_str!("../../../../../config/packwatch.dbc");
 #[test]
 fn shipped_dbc_matches_default_layout() {
     let settings = LayoutSettings { command: Some(MessageSettings::default()), ..Default::default() };
-    let mut made = layout(LayoutBase::BuiltIn(RatedPack { capacity_ah: 2.6, energy_wh: 9.6 }), &settings).unwrap();
+    let mut made = layout(LayoutBase::BuiltIn { rated_capacity_ah: 2.6 }, &settings).unwrap();
     // The default layout lacks this message, because it is sent only if commands are authenticated.
     made.messages.push(default_database().unwrap().message("PACKWATCH_Freshness").unwrap().clone());
     let written = made.to_dbc();

@@ -7,7 +7,7 @@ use crate::can::encode::{CommandPlan, OutputPlan};
 const TEXT: &str = include_str!("../../../../../config/packwatch.dbc");
 
 fn built_in(settings: &LayoutSettings) -> Result<Database, Vec<SettingFault>> {
-    layout(LayoutBase::BuiltIn(RatedPack { capacity_ah: 2.6, energy_wh: 9.6 }), settings)
+    layout(LayoutBase::BuiltIn { rated_capacity_ah: 2.6 }, settings)
 }
 
 fn on(profile: Profile, data_id: u16) -> MessageSettings {
@@ -128,7 +128,7 @@ fn layout_rebuilt_from_its_text_is_unchanged() {
         reply: on(Profile::P01A, 6),
         freshness: MessageSettings::default(),
     };
-    let made = layout(LayoutBase::BuiltIn(RatedPack { capacity_ah: 280.0, energy_wh: 1036.0 }), &settings).unwrap();
+    let made = layout(LayoutBase::BuiltIn { rated_capacity_ah: 280.0 }, &settings).unwrap();
     let read = Database::parse(&made.to_dbc()).unwrap();
     assert_eq!(read, made);
     let as_it_is = LayoutSettings { command: Some(MessageSettings::default()), ..Default::default() };
@@ -208,11 +208,7 @@ fn all_invalid_settings_are_reported_with_keys() {
 #[test]
 fn ah_steps_fit_rated_capacity() {
     let steps = |rated_capacity_ah| {
-        let made = layout(
-            LayoutBase::BuiltIn(RatedPack { capacity_ah: rated_capacity_ah, energy_wh: 3.7 * rated_capacity_ah }),
-            &LayoutSettings::default(),
-        )
-        .unwrap();
+        let made = layout(LayoutBase::BuiltIn { rated_capacity_ah }, &LayoutSettings::default()).unwrap();
         let step = |name: &str| {
             let layout = made.signal(name).unwrap().1.layout;
             let share = if name.ends_with("Std") { 0.5 } else { 2.0 };
@@ -236,13 +232,6 @@ fn ah_steps_fit_rated_capacity() {
     assert_eq!(steps(280.0), [0.1, 0.01, 0.005]);
     assert_eq!(steps(1000.0), [0.5, 0.05, 0.01]);
     assert_eq!(steps(100_000.0), [50.0, 5.0, 1.0]);
-    let made =
-        layout(LayoutBase::BuiltIn(RatedPack { capacity_ah: 120.0, energy_wh: 64_000.0 }), &LayoutSettings::default());
-    let made = made.unwrap();
-    let step = |name: &str| made.signal(&format!("PACKWATCH_Health.{name}")).unwrap().1.layout.factor;
-    let steps =
-        ["RemainingEnergy", "EnergyToFull", "RemainingEnergyStd", "DischargePower2s", "ChargePower30s"].map(step);
-    assert_eq!(steps, [0.002, 0.002, 0.01, 0.1, 0.1]);
 }
 
 #[test]

@@ -2,9 +2,7 @@
 
 use super::*;
 use crate::can::e2e::Profile;
-use crate::can::encode::{
-    E2eSetting, LayoutBase, LayoutSettings, MessageSettings, RatedPack, default_database, layout,
-};
+use crate::can::encode::{E2eSetting, LayoutBase, LayoutSettings, MessageSettings, default_database, layout};
 use crate::quantity::Fault;
 
 const TEXT: &str = include_str!("../../../../../config/packwatch.dbc");
@@ -70,7 +68,7 @@ fn shipped_dbc_has_all_signals_and_cycle_times() {
     let times_ms: Vec<_> = plan.messages().map(|sent| sent.cycle_time_ms).collect();
     assert_eq!(times_ms, [Some(100), Some(1000), Some(1000), Some(1000), None]);
     assert_eq!(plan.digest_pages(), 4);
-    assert_eq!(plan.health_pages(), 10);
+    assert_eq!(plan.health_pages(), 5);
 }
 
 #[test]
@@ -105,7 +103,7 @@ fn status_decodes_within_half_a_bit() {
 }
 
 /// For each field of the health frame: its page, its name, a value in internal units, and the decoded value.
-const HEALTH_VALUES: [(usize, &str, f64, f64); 31] = [
+const HEALTH_VALUES: [(usize, &str, f64, f64); 18] = [
     (0, "Capacity", 2.6, 2.6),
     (0, "CapacityStd", 0.0213, 0.0213),
     (0, "Soh", 0.871, 87.1),
@@ -124,19 +122,6 @@ const HEALTH_VALUES: [(usize, &str, f64, f64); 31] = [
     (4, "LamPe", 0.0391, 4.0),
     (4, "LamPeStd", 0.0512, 5.0),
     (1, "ModelState", 2.0, 2.0),
-    (5, "RemainingEnergy", 12_345.0, 12.345),
-    (5, "RemainingEnergyStd", 432.0, 0.432),
-    (5, "EnergyToFull", 4321.0, 4.321),
-    (9, "EnergySoh", 0.842, 84.2),
-    (6, "TimeToEmpty", 4321.0, 4320.0),
-    (6, "TimeToFull", 5004.0, 5000.0),
-    (6, "TimeToTarget", 1234.0, 1230.0),
-    (7, "DischargePower2s", 9870.0, 9.87),
-    (7, "DischargePower10s", 8765.0, 8.765),
-    (7, "DischargePower30s", 7654.0, 7.654),
-    (8, "ChargePower2s", 4321.0, 4.321),
-    (8, "ChargePower10s", 3210.0, 3.21),
-    (8, "ChargePower30s", 2109.0, 2.109),
 ];
 
 fn health_fields(of: impl Fn(usize) -> Option<f64>) -> HealthFields {
@@ -156,35 +141,18 @@ fn health_fields(of: impl Fn(usize) -> Option<f64>) -> HealthFields {
         lam_ne: [of(13), of(14)],
         lam_pe: [of(15), of(16)],
         model_state: of(17).map(|state| state as u8),
-        outlook: OutlookFields {
-            remaining_wh: [of(18), of(19)],
-            to_full_wh: of(20),
-            energy_soh: of(21),
-            to_empty_s: of(22),
-            to_full_s: of(23),
-            to_target_s: of(24),
-            discharge_w: [of(25), of(26), of(27)],
-            charge_w: [of(28), of(29), of(30)],
-            limiting_cells: None,
-        },
     }
 }
 
 #[test]
 fn health_pages_decode_within_half_a_bit() {
     let fields = health_fields(|n| Some(HEALTH_VALUES[n].2));
-    let limiting_cells = Some([CellIndex(7), CellIndex(11)]);
-    let limited = HealthFields { outlook: OutlookFields { limiting_cells, ..fields.outlook }, ..fields };
-    for (name, cell) in [("DischargeLimitingCell", 7.0), ("ChargeLimitingCell", 11.0)] {
-        assert_decodes(&format!("Health.{name}"), &plan().health(9, &limited), cell);
-        assert_not_available(&format!("Health.{name}"), &plan().health(9, &fields));
-    }
     for (page, name, _, wanted) in HEALTH_VALUES {
         let frame = plan().health(page, &fields);
         assert_decodes(&format!("Health.{name}"), &frame, wanted);
         assert_eq!(read("Health.Page", &frame).0, u64::try_from(page).unwrap());
         assert_eq!((frame.len(), &frame.data()[..2]), (8, &[0, 0][..]));
-        assert_eq!(plan().health(page + 10, &fields), frame, "the first page follows the last");
+        assert_eq!(plan().health(page + 5, &fields), frame, "the first page follows the last");
     }
 }
 
@@ -378,8 +346,8 @@ fn ambiguous_value_signals_are_rejected() {
     );
     let unreachable = faults("Page M : 16|4@1+", "Page M : 16|1@1+").len();
     assert_eq!(
-        unreachable, 33,
-        "health: three signals on page 2, three on page 3, six on page 4, three each on pages 5 to 9; digest: three each on pages 2 and 3"
+        unreachable, 18,
+        "health: three signals on page 2, three on page 3, six on page 4; digest: three each on pages 2 and 3"
     );
 }
 
@@ -426,7 +394,7 @@ fn messages_are_protected_with_separate_counters() {
         };
         let settings =
             LayoutSettings { status: settings(1), health: settings(2), alarm: settings(3), ..Default::default() };
-        let database = layout(LayoutBase::BuiltIn(RatedPack { capacity_ah: 2.6, energy_wh: 9.6 }), &settings).unwrap();
+        let database = layout(LayoutBase::BuiltIn { rated_capacity_ah: 2.6 }, &settings).unwrap();
         let plan = OutputPlan::new(&database).unwrap();
         let protections: Vec<_> = plan.messages().filter_map(|sent| sent.protection).collect();
         let [status, health, alarm] = protections[..] else { panic!("three are protected") };
@@ -454,10 +422,7 @@ fn counters_survive_restart_and_profile_change() {
     let protection = Protection { profile: Profile::P01A, data_id: 9 };
     let status = MessageSettings { e2e: E2eSetting::On(protection), ..Default::default() };
     let settings = LayoutSettings { status, ..Default::default() };
-    let plan = OutputPlan::new(
-        &layout(LayoutBase::BuiltIn(RatedPack { capacity_ah: 2.6, energy_wh: 9.6 }), &settings).unwrap(),
-    )
-    .unwrap();
+    let plan = OutputPlan::new(&layout(LayoutBase::BuiltIn { rated_capacity_ah: 2.6 }, &settings).unwrap()).unwrap();
     let stored = r#"{"status":200,"health":0,"alarm":3,"digest":0,"reply":0}"#;
     let mut counters: SendCounters = serde_json::from_str(stored).unwrap();
     let frames = [(); 2].map(|()| plan.status(&StatusFields::default(), &mut counters));
