@@ -62,6 +62,7 @@ fn description(branch: &str) -> &'static str {
             "Values of each cell. An array has a value only if every cell has one; cells are identified by relative \
                     position in array."
         }
+        "Charging" => "The charge in progress.",
         "CurrentSensor" => "The current sensor.",
         "Energy" => "Energy and time to full and to empty.",
         "Loss" => "Losses of the weakest cell.",

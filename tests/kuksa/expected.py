@@ -11,7 +11,8 @@ VSS = {
     "CurrentVoltage": "float", "CurrentCurrent": "float", "CurrentPower": "float",
     "Temperature.Average": "float", "Temperature.Min": "float", "Temperature.Max": "float", "Temperature.CellTemperature": "float[]",
     "CellVoltage.Min": "float", "CellVoltage.IdMin": "uint16", "CellVoltage.Max": "float", "CellVoltage.IdMax": "uint16",
-    "CellVoltage.CellVoltages": "float[]", "StateOfCharge.Current": "float", "StateOfHealth": "float", "ErrorCodes": "string[]",
+    "CellVoltage.CellVoltages": "float[]", "StateOfCharge.Current": "float", "StateOfCharge.CurrentEnergy": "float",
+    "Charging.TimeToComplete": "uint32", "StateOfHealth": "float", "ErrorCodes": "string[]",
     # Signals of VSS that packwatch does not provide.
     "NetCapacity": "uint16", "StateOfCharge.Displayed": "float", "Charging.IsCharging": "boolean", "Range": "uint32",
 }
@@ -56,6 +57,8 @@ def standard(document):
         "CellVoltage.IdMax": None if volts is None else volts.index(max(volts)),
         "CellVoltage.CellVoltages": volts,
         "StateOfCharge.Current": scaled(pack["soc"], 100.0),
+        "StateOfCharge.CurrentEnergy": scaled(pack["remaining_energy_wh"], 1e-3),
+        "Charging.TimeToComplete": None if pack["time_to_full_s"] is None else round(single(pack["time_to_full_s"])),
         "StateOfHealth": None if (pack["soh"] or 0) > 1 else scaled(pack["soh"], 100.0),
         "ErrorCodes": codes,
     }
@@ -88,6 +91,7 @@ def overlay(document):
         "Cells.Current": array(cells, "current_a", -1.0),
     }
     values |= {name: single(pack[key]) for name, key in PACK_NUMBERS.items()}
+    values |= {name: scaled(pack[key], 1e-3) for name, key in PACK_ENERGIES.items()}
     values |= {name: scaled(pack[key], 100.0) for name, key in PACK_PERCENT.items()}
     values |= {f"Cells.{name}": array(cells, key) for name, key in CELL_NUMBERS.items()}
     values |= {f"Cells.{name}": array(cells, key, 100.0) for name, key in CELL_PERCENT.items()}
@@ -110,10 +114,21 @@ PACK_NUMBERS = {
     "RechargePeriod.Normalised": "normalised_recharge_period_s",
     "RechargePeriod.NormalisedStandardDeviation": "normalised_recharge_period_std_s",
     "CurrentSensor.OffsetStandardDeviation": "current_offset_std_a",
+    "Charging.TimeToCompleteStandardDeviation": "time_to_full_std_s",
+    "Energy.TimeToEmpty": "time_to_empty_s", "Energy.TimeToEmptyStandardDeviation": "time_to_empty_std_s",
+    "Energy.TimeToTarget": "time_to_target_s", "Energy.TimeToTargetStandardDeviation": "time_to_target_std_s",
+} | {
+    f"Power.{kind}{time}{name}": f"{kind.lower()}_power_{time}{key}_w" for kind in ("Discharge", "Charge")
+    for time in ("2s", "10s", "30s") for name, key in (("", ""), ("StandardDeviation", "_std"))
+}
+PACK_ENERGIES = {
+    "StateOfCharge.CurrentEnergyStandardDeviation": "remaining_energy_std_wh",
+    "Energy.ToFull": "energy_to_full_wh", "Energy.ToFullStandardDeviation": "energy_to_full_std_wh",
 }
 PACK_PERCENT = {
     "StateOfCharge.CurrentStandardDeviation": "soc_std", "StateOfCharge.Low": "soc_low", "StateOfCharge.High": "soc_high",
     "StateOfCharge.Reported": "reported_soc", "StateOfHealth.Learned": "soh", "StateOfHealth.LearnedStandardDeviation": "soh_std", "StateOfHealth.Reported": "reported_soh",
+    "StateOfHealth.Energy": "energy_soh", "StateOfHealth.EnergyStandardDeviation": "energy_soh_std",
     "Loss.LithiumInventory": "lli", "Loss.LithiumInventoryStandardDeviation": "lli_std",
     "Loss.NegativeElectrode": "lam_ne", "Loss.NegativeElectrodeStandardDeviation": "lam_ne_std",
     "Loss.PositiveElectrode": "lam_pe", "Loss.PositiveElectrodeStandardDeviation": "lam_pe_std",

@@ -71,7 +71,12 @@ impl Signal {
         match self.source {
             Source::Document(value) => value(document),
             Source::Pack(quantity, part, factor) => {
-                scaled(document.pack.values.part(quantity, part), factor).map(Value::Float)
+                let value = scaled(document.pack.values.part(quantity, part), factor)?;
+                if self.data_type != DataType::Uint32 {
+                    return Some(Value::Float(value));
+                }
+                #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "the range is checked")]
+                (0.0..=1e9).contains(&value).then(|| Value::Uint32(value.round() as u32))
             }
             Source::Cells(quantity, part, factor) => {
                 of_cells(document, |cell| scaled(cell.values.part(quantity, part), factor)).map(Value::Floats)
@@ -107,6 +112,8 @@ fn signals_of(row: &'static QuantityRow, it: &'static Presentation, is_pack: boo
     let sign = if row.unit == Unit::Amperes { ", positive = into the battery" } else { "" };
     row.parts().map(move |(part, key)| {
         let (origin, name) = path(it.vss, part);
+        // The times of VSS itself are whole seconds.
+        let is_whole = origin == Origin::Standard && row.unit == Unit::Seconds;
         let about = match part {
             Part::Mean => format!("{}{sign}", it.about),
             Part::Std => format!("Standard deviation: {}", it.about),
@@ -121,7 +128,7 @@ fn signals_of(row: &'static QuantityRow, it: &'static Presentation, is_pack: boo
         Signal {
             name,
             origin,
-            data_type,
+            data_type: if is_whole { DataType::Uint32 } else { data_type },
             unit: unit.filter(|_| is_pack),
             description: description.into(),
             fields: format!("{owner}.{key}").into(),
