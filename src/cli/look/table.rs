@@ -40,7 +40,11 @@ impl PackTable {
         };
         match read(false) {
             Err(of_cells @ LogError::Data(_)) if cells > 1 => {
-                read(true).map_err(|error: LogError| Failure::new(format!("{of_cells}\n{error}")))
+                let of_cells = of_cells.to_string();
+                read(true).map_err(|error: LogError| match error.to_string() {
+                    of_total if of_total == of_cells => Failure::new(of_total),
+                    of_total => Failure::new(format!("{of_cells}\n{of_total}")),
+                })
             }
             found => found.map_err(failed),
         }
