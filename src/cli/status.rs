@@ -12,7 +12,7 @@ use std::path::PathBuf;
 use super::common::output::{print, word};
 use crate::monitor::PackView;
 use crate::quantity::CellIndex;
-use crate::quantity::catalogue::{Estimate, Quantity, Unit, Values};
+use crate::quantity::catalogue::{Estimate, PackValues, Quantity, Unit, Values};
 use crate::status::client::{StatusClient, parse};
 use crate::status::document::StatusDocument;
 use crate::status::metrics::openmetrics;
@@ -96,6 +96,17 @@ fn with_std<const IS_PACK: bool>(values: &Values<IS_PACK>, quantity: Quantity, d
     }
 }
 
+/// Formats an energy or a power with its standard deviation; from 1000 on in kWh or kW.
+fn large(values: &PackValues, quantity: Quantity) -> String {
+    let (unit, _) = screen_unit(quantity.row().unit);
+    match values.get(quantity) {
+        Some(Estimate { mean, std: Some(std) }) if mean >= 1000.0 => {
+            format!("{:.1} ± {:.1} k{}", mean / 1000.0, std / 1000.0, unit.trim())
+        }
+        _ => with_std(values, quantity, 1),
+    }
+}
+
 /// Formats a value without its standard deviation; an unknown value becomes a dash.
 fn mean<const IS_PACK: bool>(values: &Values<IS_PACK>, quantity: Quantity, decimals: usize) -> String {
     let (unit, factor) = screen_unit(quantity.row().unit);
@@ -111,8 +122,8 @@ const fn screen_unit(unit: Unit) -> (&'static str, f64) {
         Unit::Amperes => (" A", 1.0),
         Unit::Celsius => (" °C", 1.0),
         Unit::AmpereHours => (" Ah", 1.0),
-        Unit::WattHours => (" kWh", 1e-3),
-        Unit::Watts => (" kW", 1e-3),
+        Unit::WattHours => (" Wh", 1.0),
+        Unit::Watts => (" W", 1.0),
         Unit::Seconds => (" s", 1.0),
         Unit::Days => (" days", 1.0),
         Unit::Cycles => (" cycles", 1.0),

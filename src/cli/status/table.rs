@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use super::{config, duration, in_brackets, mean, number, shown, soc_band, store, with_std, word};
+use super::{config, duration, in_brackets, large, mean, number, shown, soc_band, store, with_std, word};
 use crate::cli::common::alarms::{AlarmGroup, grouped};
 use crate::cli::common::output;
 use crate::io::stamp;
@@ -82,7 +82,7 @@ fn pack(text: &mut String, document: &StatusDocument) {
     let _ = writeln!(text, "energy     {}", energy(&pack.values));
     if pack.values.get(Quantity::DischargePower10s).is_some() {
         let [discharge, charge] = [Quantity::DischargePower10s, Quantity::ChargePower10s];
-        let (discharge, charge) = (with_std(&pack.values, discharge, 1), with_std(&pack.values, charge, 1));
+        let (discharge, charge) = (large(&pack.values, discharge), large(&pack.values, charge));
         let [drawn, charged] = [0, 1].map(|k| in_brackets(pack.power_limiting_cells.map(|cells| cells[k])));
         let _ = writeln!(text, "power      for 10 s: discharge {discharge}{drawn}, charge {charge}{charged}");
     }
@@ -112,8 +112,8 @@ fn pack(text: &mut String, document: &StatusDocument) {
 fn energy(values: &PackValues) -> String {
     let mut text = format!(
         "remaining {}, to full {}",
-        with_std(values, Quantity::RemainingEnergy, 2),
-        with_std(values, Quantity::EnergyToFull, 2),
+        large(values, Quantity::RemainingEnergy),
+        large(values, Quantity::EnergyToFull),
     );
     for (what, quantity) in
         [("empty", Quantity::TimeToEmpty), ("full", Quantity::TimeToFull), ("the target", Quantity::TimeToTarget)]

@@ -10,7 +10,7 @@ fn short_pack_lists_all_cells_with_dashes_for_unknown() {
 packwatch 1.2.3, process 4711, up 3 h 12 min, 2027-01-15T08:00:00Z, configuration pack.toml (01234567)
 found      cell 1: loses charge by itself, 0.15 ± 0.01 % of its capacity a day, for 2 d 7 h
 pack       valid: SOC 63.2 % (95 %: 60.8 to 65.6 %), discharge, 10.95 V, 12.50 A, at most 31.2 °C
-energy     remaining 0.54 ± 0.02 kWh, to full -, 1 h 12 min ± 10 min 0 s to empty
+energy     remaining 541.0 ± 23.0 Wh, to full -, 1 h 12 min ± 10 min 0 s to empty
 power      for 10 s: discharge 8.2 ± 0.4 kW (cell 1), charge - (cell 1)
 health     capacity 2.412 ± 0.021 Ah (cell 1), SOH 92.8 %, usable 2.310 ± 0.040 Ah, recharge period -, with the \
 reference charger 5432 ± 61 s
