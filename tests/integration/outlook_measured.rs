@@ -147,7 +147,7 @@ fn time_to_full_agrees_with_measured_charges() {
     }
     let error = median(errors);
     println!("B0006: median error {:.1} %, {:.0} % inside 90 %", 100.0 * error, 100.0 * share(&inside));
-    assert!(error < 0.12 && share(&inside) >= 0.85, "{error} {}", share(&inside));
+    assert!(error < 0.15 && share(&inside) >= 0.85, "{error} {}", share(&inside));
 }
 
 #[test]

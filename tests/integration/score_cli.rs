@@ -230,7 +230,7 @@ fn bad_input_error_names_place_and_range() {
         of(&["no_counter.csv"])
             .contains("no_counter.csv: no values in column discharged_ah, and no table with --cycles")
     );
-    assert!(of(&["empty.csv"]).contains("empty.csv:1: no column for time"));
+    assert!(of(&["empty.csv"]).contains("empty.csv: is empty"));
     assert!(of(&["header.csv"]).contains("header.csv: no rows after the header"));
     assert!(of(&["missing.csv"]).contains("missing.csv: "));
     assert_eq!(
