@@ -54,7 +54,7 @@ fn names_follow_vss_rules() {
         let is_flag = signal.data_type.name().starts_with("boolean");
         assert_eq!(is_flag, leaf.starts_with("Is"), "{}", signal.name);
         assert!(
-            signal.unit.is_none_or(|unit| ["percent", "V", "A", "Ah", "s", "day"].contains(&unit)),
+            signal.unit.is_none_or(|unit| ["percent", "V", "A", "Ah", "kWh", "W", "s", "day"].contains(&unit)),
             "{}",
             signal.name
         );

@@ -6,6 +6,7 @@ use super::*;
 
 /// Device classes of Home Assistant that the messages use, and the units that Home Assistant accepts for each class.
 const CLASSES: &[(&str, &[&str])] = &[
+    ("energy_storage", &["Wh", "kWh"]),
     ("battery", &["%"]),
     ("current", &["A", "mA"]),
     ("data_size", &["B", "kB", "MB"]),
