@@ -29,8 +29,7 @@ impl Row {
 
 fn fit(folder: &Path, args: &[&str]) -> PathBuf {
     let model = folder.join("model.toml");
-    let files =
-        args.iter().map(|word| if word.contains('/') { measured::path(word).into() } else { PathBuf::from(word) });
+    let files = args.iter().map(|word| if word.contains('/') { measured::path(word) } else { PathBuf::from(word) });
     let mut command = Command::cargo_bin("packwatch").unwrap();
     command.args(["fit", "--name", "cell", "-o"]).arg(&model).args(files).assert().success();
     model
