@@ -15,7 +15,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::cell::{CellModel, GridPosition, MAX_BRANCHES};
+use crate::cell::{CellModel, GridPosition, MAX_BRANCHES, USUAL_LOAD_PER_H};
 use crate::filter::{ScalarGaussian, bisect, square};
 use crate::quantity::{CellIndex, InvalidState, Mode, Timestamp};
 
@@ -25,14 +25,11 @@ pub const POWER_S: [f64; 3] = [2.0, 10.0, 30.0];
 const LOAD_S: f64 = 1800.0;
 /// Standard deviation of ln(time that the charger holds the voltage). Models without a slow branch taper too fast.
 const LOG_HELD_STD: f64 = 0.7;
-/// A longer gap without a current is not averaged (s).
-const GAP_S: f64 = 600.0;
 /// Standard deviation of ln(future load over recent load): a driver needs a third more or less in the next half hour.
 const LOG_LOAD_STD: f64 = 0.3;
-/// Time over which the current of a charge is averaged (s). A charger regulates its current.
+/// Time over which the current of a charge is averaged (s). A charger regulates its current. Braking ends sooner, so a
+/// charge counts only after this time. A longer gap between two currents is not averaged.
 const CHARGER_S: f64 = 60.0;
-/// Load that is assumed before the first one was seen, per rated capacity (1/h): a vehicle that drives for five hours.
-const USUAL_LOAD_PER_H: f64 = 0.2;
 /// Halvings of a search for a SOC: 0.02 %.
 const HALVINGS: u32 = 12;
 /// Steps of the search for the current at a voltage limit. The SOC moves by less than 1 % in 30 s at 1C.
@@ -105,7 +102,7 @@ impl RecentLoad {
     pub fn observe(&mut self, now: Timestamp, mode: Mode, current_a: Option<f64>, rest_a: f64) {
         let seconds = self.latest.map_or(0.0, |latest| now.since(latest));
         self.latest = Some(now);
-        let Some(current_a) = current_a.filter(|_| seconds > 0.0 && seconds <= GAP_S) else { return };
+        let Some(current_a) = current_a.filter(|_| seconds > 0.0 && seconds <= CHARGER_S) else { return };
         match mode {
             Mode::Charge => self.charge.add(-current_a, seconds, CHARGER_S),
             Mode::Rest if current_a.abs() <= rest_a => self.charge = Average::default(),
@@ -116,7 +113,8 @@ impl RecentLoad {
 
     /// The charger's current (A, positive), if the pack is being charged.
     fn charger_a(&self, mode: Mode) -> Option<f64> {
-        Some(self.charge.mean_a).filter(|current_a| mode == Mode::Charge && *current_a > 0.0)
+        let is_charger = mode == Mode::Charge && self.charge.seconds >= CHARGER_S;
+        Some(self.charge.mean_a).filter(|current_a| is_charger && *current_a > 0.0)
     }
 
     /// Shifts the time of the latest current by `by_nanos`, to another clock.
@@ -232,35 +230,6 @@ impl CellState<'_> {
         self.capacity.mean * (self.soc.mean - self.empty_soc(load, config)).max(0.0)
     }
 
-    /// Charge (Ah) and energy (Wh) that the cell delivers until it is empty, with variances. Resistance and load have
-    /// the same effect: on the voltage, and on the SOC of the empty cell.
-    fn remaining(&self, load: &Load, config: &OutlookConfig) -> [ScalarGaussian; 2] {
-        let (capacity_ah, soc) = (self.capacity.mean, self.soc.mean);
-        let empty = self.empty_soc(load, config);
-        let charge_ah = capacity_ah * (soc - empty).max(0.0);
-        let energy_wh = self.delivered_wh(charge_ah, load);
-        let (now_v, _) = self.loaded_v(soc, load);
-        let (end_v, end_peak_v) = self.loaded_v(empty, load);
-        let slope_v = (self.loaded_v(empty + 0.01, load).1 - end_peak_v) / 0.01;
-        let peak_drop_v = self.ocv_v(empty) - end_peak_v;
-        let empty_by_log = if empty > 0.0 && slope_v > 0.0 { (peak_drop_v / slope_v).min(1.0) } else { 0.0 };
-        let loss_wh = charge_ah * (mean_of(|part| self.ocv_v(soc + part * (empty - soc)))) - energy_wh;
-        let log_variance = self.log_resistance.variance + square(LOG_LOAD_STD);
-        let variance = |by_soc: f64, by_log: f64, value: f64| {
-            square(by_soc) * self.soc.variance
-                + square(value / capacity_ah) * self.capacity.variance
-                + square(by_log) * log_variance
-        };
-        let by_log_ah = capacity_ah * empty_by_log;
-        [
-            ScalarGaussian { mean: charge_ah, variance: variance(capacity_ah, by_log_ah, charge_ah) },
-            ScalarGaussian {
-                mean: energy_wh,
-                variance: variance(capacity_ah * now_v, loss_wh + by_log_ah * end_v, energy_wh),
-            },
-        ]
-    }
-
     /// Charge (Ah) that the cell takes up until it is full: until the taper current keeps it at its highest voltage.
     fn chargeable_ah(&self, config: &OutlookConfig) -> f64 {
         let soc = self.soc.mean;
@@ -313,10 +282,8 @@ impl CellState<'_> {
         (self.ocv_v(self.soc.mean - moved) - relaxing_v, self.ohm(self.soc.mean - 0.5 * moved, after_s))
     }
 
-    /// Largest current (A, positive) in a direction that keeps the cell within its limits for `for_s`, and the
-    /// standard deviation of this current.
-    fn limit_a(&self, direction: Direction, for_s: f64, config: &OutlookConfig) -> ScalarGaussian {
-        let per_soc_a = 3600.0 * self.capacity.mean / for_s;
+    /// Largest current (A, positive) in a direction that keeps the cell within its limits for `for_s`.
+    fn limit_a(&self, direction: Direction, for_s: f64, config: &OutlookConfig) -> f64 {
         let (sign, room, max_a, limit_v) = match direction {
             Direction::Discharge => {
                 (1.0, self.soc.mean, config.max_discharge_a, config.min_voltage_v.unwrap_or(self.model.voltage_min_v))
@@ -326,20 +293,12 @@ impl CellState<'_> {
                 (-1.0, 1.0 - self.soc.mean, config.max_charge_a, limit_v)
             }
         };
-        let most_a = max_a.unwrap_or(f64::INFINITY).min(per_soc_a * room.max(0.0));
-        let (mut current_a, mut ohm) = (0.0, 0.0);
-        for _ in 0..CURRENT_STEPS {
-            let (open_v, after_ohm) = self.response(sign * current_a, for_s);
-            current_a = (sign * (open_v - limit_v) / after_ohm).clamp(0.0, most_a);
-            ohm = after_ohm;
-        }
-        if current_a >= most_a {
-            let by_room_a = if max_a.is_some_and(|max_a| max_a <= most_a) { 0.0 } else { per_soc_a };
-            return ScalarGaussian { mean: most_a, variance: square(by_room_a) * self.soc.variance };
-        }
-        let slope_v = self.model.ocv_slope_v(&self.position(self.soc.mean), self.capacity.mean);
-        let variance = square(slope_v / ohm) * self.soc.variance + square(current_a) * self.log_resistance.variance;
-        ScalarGaussian { mean: current_a, variance }
+        let by_charge_a = 3600.0 * self.capacity.mean / for_s * room.max(0.0);
+        let most_a = max_a.unwrap_or(f64::INFINITY).min(by_charge_a);
+        (0..CURRENT_STEPS).fold(0.0, |current_a, _| {
+            let (open_v, ohm) = self.response(sign * current_a, for_s);
+            (sign * (open_v - limit_v) / ohm).clamp(0.0, most_a)
+        })
     }
 
     /// Voltage (V) after `after_s` of a current in a direction (A, positive).
@@ -350,23 +309,24 @@ impl CellState<'_> {
     }
 
     /// A value of the cell with its variance. `value` is computed again with each of SOC, capacity and ln resistance one
-    /// standard deviation higher and lower.
+    /// standard deviation higher and lower; the larger change counts, because a SOC of 0 or 1 changes to one side only.
     fn spread(&self, value: impl Fn(&Self) -> f64) -> ScalarGaussian {
-        let half = |change: fn(&mut Self, f64)| {
-            let [low, high] = [-1.0, 1.0].map(|sigmas| {
+        let mean = value(self);
+        let part = |change: fn(&mut Self, f64)| {
+            let changes = [-1.0, 1.0].map(|sigmas| {
                 let mut other = *self;
                 change(&mut other, sigmas);
-                value(&other)
+                square(value(&other) - mean)
             });
-            square(0.5 * (high - low))
+            changes[0].max(changes[1])
         };
-        let variance = half(|cell, sigmas| cell.soc.mean = (cell.soc.mean + sigmas * cell.soc.std()).clamp(0.0, 1.0))
-            + half(|cell, sigmas| {
+        let variance = part(|cell, sigmas| cell.soc.mean = (cell.soc.mean + sigmas * cell.soc.std()).clamp(0.0, 1.0))
+            + part(|cell, sigmas| {
                 let capacity_ah = cell.capacity.mean + sigmas * cell.capacity.std();
                 cell.capacity.mean = capacity_ah.max(0.1 * cell.capacity.mean);
             })
-            + half(|cell, sigmas| cell.log_resistance.mean += sigmas * cell.log_resistance.std());
-        ScalarGaussian { mean: value(self), variance }
+            + part(|cell, sigmas| cell.log_resistance.mean += sigmas * cell.log_resistance.std());
+        ScalarGaussian { mean, variance }
     }
 }
 
@@ -420,7 +380,10 @@ pub fn of_pack(
     let rated_ah = cells.first()?.model.rated_capacity_ah;
     let discharge = load.discharge.load();
     let drawn = discharge.unwrap_or(Load::usual(rated_ah));
-    let charger_a = load.charger_a(mode).unwrap_or(USUAL_LOAD_PER_H * rated_ah);
+    let charger = load.charger_a(mode);
+    let charger_a = charger.unwrap_or(USUAL_LOAD_PER_H * rated_ah);
+    // A weaker charger ends as soon as the voltage is reached.
+    let config = &OutlookConfig { taper_current_a: config.taper_current_a.min(charger_a), ..*config };
     let least = |value: &dyn Fn(&CellState<'_>) -> f64| {
         cells.iter().map(|cell| (value(cell), cell)).min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, cell)| cell)
     };
@@ -434,7 +397,11 @@ pub fn of_pack(
         mean: sum(value),
         variance: square(sum(&|_| 1.0)) * one.variance,
     };
-    let [drawn_ah, energy] = weakest.remaining(&drawn, config);
+    // Resistance and load have the same effect on the voltage.
+    let variance = weakest.log_resistance.variance + square(LOG_LOAD_STD);
+    let loaded = CellState { log_resistance: ScalarGaussian { variance, ..weakest.log_resistance }, ..*weakest };
+    let drawn_ah = loaded.spread(|cell| cell.dischargeable_ah(&drawn, config));
+    let energy = loaded.spread(|cell| cell.delivered_wh(cell.dischargeable_ah(&drawn, config), &drawn));
     let taken_ah = fullest.chargeable_ah(config);
     let to_full = fullest.spread(|cell| cell.taken_wh(cell.chargeable_ah(config), charger_a, config));
     let to_empty_s = discharge.filter(|_| mode == Mode::Discharge).map(|load| {
@@ -450,12 +417,14 @@ pub fn of_pack(
         load.charger_a(mode).map(|_| ScalarGaussian { variance, ..time_s })
     };
     let powers = |direction| {
-        let limits = cells.iter().map(|cell| cell.limit_a(direction, POWER_S[1], config).mean).enumerate();
+        let limits = cells.iter().map(|cell| cell.limit_a(direction, POWER_S[1], config)).enumerate();
         let (index, _) = limits.min_by(|a, b| a.1.total_cmp(&b.1))?;
         let powers = POWER_S.map(|for_s| {
-            let limit = cells[index].limit_a(direction, for_s, config);
-            let voltage_v = sum(&|cell| cell.voltage_after(direction, limit.mean, for_s));
-            ScalarGaussian { mean: limit.mean * voltage_v, variance: square(voltage_v) * limit.variance }
+            let power_w =
+                |cell: &CellState<'_>, limit_a: f64| limit_a * cell.voltage_after(direction, limit_a, for_s);
+            let limit_a = cells[index].limit_a(direction, for_s, config);
+            let one = cells[index].spread(|cell| power_w(cell, cell.limit_a(direction, for_s, config)));
+            whole(one, &|cell| power_w(cell, limit_a))
         });
         Some((powers, CellIndex(u16::try_from(index).unwrap_or(u16::MAX))))
     };
