@@ -79,7 +79,7 @@
 //! | a configuration key | `host/config/schema/keys/` (files `pack`, `input`, `limits`, `algorithms`, `traffic`), `host/config/mod.rs` (list of the steps) |
 //! | discovery and merging of drop-ins | `host/config/document/source.rs`, `host/config/document/merge.rs` |
 //! | identity of the vehicle | `host/config/result/vehicle.rs` |
-//! | a published number of pack or cell (status, metrics, MQTT, VSS) | `core/quantity/catalogue.rs` (row), `core/monitor/view.rs` (value) |
+//! | a published number of pack or cell (status, metrics, MQTT, VSS) | `core/quantity/catalogue/table.rs` (row), `core/monitor/view.rs` (value) |
 //! | another status field | `host/status/document.rs` (type), `host/status/collect.rs` (value), `cli/status` (screen) |
 //! | another metric | `host/status/metrics.rs` |
 //! | another MQTT entity | `uplink/mqtt/entity.rs` |

@@ -20,7 +20,7 @@ pub mod notebook;
 pub mod own_model;
 
 pub use aged_ocv::{AgedOcv, AgeingLaw};
-pub use chemistry::{Chemistry, Label, LabelPrior};
+pub use chemistry::{Chemistry, Label, LabelPrior, USUAL_LOAD_PER_H};
 pub use config::{
     CapacityState, ConsistencySettings, Discretisation, EstimatorConfig, GapSettings, GateSettings, InitialState,
     ProcessNoise, SensorErrors, SigmaPointSettings, VoltageError,

@@ -1,6 +1,6 @@
 //! Outlook: energy, time and power that a pack can deliver or take up from now on.
 //!
-//! In: state and model of every cell ([`CellState`]), the recent load ([`RecentLoad`]) and the limits
+//! In: state and model of every cell ([`CellNow`]), the recent load ([`RecentLoad`]) and the limits
 //! ([`OutlookConfig`]). Out: [`Outlook`] of the pack, with variances. Currents are per cell, positive = discharge.
 //!
 //! * All cells of a series pack carry the same charge. A discharge ends when the first cell is empty, a charge when the
@@ -166,15 +166,15 @@ impl Load {
     }
 }
 
-/// State of one cell.
+/// What is known about one cell.
 #[derive(Debug, Clone, Copy)]
-pub struct CellState<'a> {
+pub struct CellNow<'a> {
     pub model: &'a CellModel,
     /// State of charge, fraction.
     pub soc: ScalarGaussian,
     /// Capacity (Ah).
     pub capacity: ScalarGaussian,
-    /// ln of the resistance relative to the model.
+    /// ln of the resistance relative to the model, with the model's own error at this SOC and temperature.
     pub log_resistance: ScalarGaussian,
     /// Additional resistance ratio of the slowest branch.
     pub slow_ratio: f64,
@@ -191,7 +191,7 @@ enum Direction {
     Charge,
 }
 
-impl CellState<'_> {
+impl CellNow<'_> {
     fn position(&self, soc: f64) -> GridPosition {
         self.model.grid_position(soc, self.temperature_c)
     }
@@ -360,7 +360,7 @@ pub struct Outlook {
 /// Structure of the pack.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Structure {
-    /// Cells in series per [`CellState`]: 1, or the number of cells if only the pack's total voltage is measured.
+    /// Cells in series per [`CellNow`]: 1, or the number of cells if only the pack's total voltage is measured.
     pub series_per_state: f64,
     /// Parallel strings.
     pub strings: f64,
@@ -374,7 +374,7 @@ pub struct Structure {
 pub fn of_pack(
     config: &OutlookConfig,
     (load, mode): (&RecentLoad, Mode),
-    cells: &[CellState<'_>],
+    cells: &[CellNow<'_>],
     pack: &Structure,
 ) -> Option<Outlook> {
     let rated_ah = cells.first()?.model.rated_capacity_ah;
@@ -384,22 +384,22 @@ pub fn of_pack(
     let charger_a = charger.unwrap_or(USUAL_LOAD_PER_H * rated_ah);
     // A weaker charger ends as soon as the voltage is reached.
     let config = &OutlookConfig { taper_current_a: config.taper_current_a.min(charger_a), ..*config };
-    let least = |value: &dyn Fn(&CellState<'_>) -> f64| {
+    let least = |value: &dyn Fn(&CellNow<'_>) -> f64| {
         cells.iter().map(|cell| (value(cell), cell)).min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, cell)| cell)
     };
     let weakest = least(&|cell| cell.soc.mean * cell.capacity.mean)?;
     let fullest = least(&|cell| (1.0 - cell.soc.mean) * cell.capacity.mean)?;
-    let sum = |value: &dyn Fn(&CellState<'_>) -> f64| {
+    let sum = |value: &dyn Fn(&CellNow<'_>) -> f64| {
         pack.strings * pack.series_per_state * cells.iter().map(value).sum::<f64>()
     };
     // The errors of all cells count as equal, because they share the current sensor and the model.
-    let whole = |one: ScalarGaussian, value: &dyn Fn(&CellState<'_>) -> f64| ScalarGaussian {
+    let whole = |one: ScalarGaussian, value: &dyn Fn(&CellNow<'_>) -> f64| ScalarGaussian {
         mean: sum(value),
         variance: square(sum(&|_| 1.0)) * one.variance,
     };
     // Resistance and load have the same effect on the voltage.
     let variance = weakest.log_resistance.variance + square(LOG_LOAD_STD);
-    let loaded = CellState { log_resistance: ScalarGaussian { variance, ..weakest.log_resistance }, ..*weakest };
+    let loaded = CellNow { log_resistance: ScalarGaussian { variance, ..weakest.log_resistance }, ..*weakest };
     let drawn_ah = loaded.spread(|cell| cell.dischargeable_ah(&drawn, config));
     let energy = loaded.spread(|cell| cell.delivered_wh(cell.dischargeable_ah(&drawn, config), &drawn));
     let taken_ah = fullest.chargeable_ah(config);
@@ -410,18 +410,17 @@ pub fn of_pack(
         ScalarGaussian { mean: per_ah_s * drawn_ah.mean, variance }
     });
     let target_soc = fullest.soc.mean + (config.target_soc - pack.soc) * pack.capacity_ah / fullest.capacity.mean;
-    let charging = |charge_ah: &dyn Fn(&CellState<'_>) -> f64| {
+    let charging = |charge_ah: &dyn Fn(&CellNow<'_>) -> f64| {
         let time_s = fullest.spread(|cell| cell.charging_s(charge_ah(cell), charger_a, config));
         let held_s = time_s.mean - 3600.0 * charge_ah(fullest) / charger_a;
         let variance = time_s.variance + square(LOG_HELD_STD * held_s);
-        load.charger_a(mode).map(|_| ScalarGaussian { variance, ..time_s })
+        charger.map(|_| ScalarGaussian { variance, ..time_s })
     };
     let powers = |direction| {
         let limits = cells.iter().map(|cell| cell.limit_a(direction, POWER_S[1], config)).enumerate();
         let (index, _) = limits.min_by(|a, b| a.1.total_cmp(&b.1))?;
         let powers = POWER_S.map(|for_s| {
-            let power_w =
-                |cell: &CellState<'_>, limit_a: f64| limit_a * cell.voltage_after(direction, limit_a, for_s);
+            let power_w = |cell: &CellNow<'_>, limit_a: f64| limit_a * cell.voltage_after(direction, limit_a, for_s);
             let limit_a = cells[index].limit_a(direction, for_s, config);
             let one = cells[index].spread(|cell| power_w(cell, cell.limit_a(direction, for_s, config)));
             whole(one, &|cell| power_w(cell, limit_a))
@@ -444,18 +443,18 @@ pub fn of_pack(
     })
 }
 
-/// Energy of the full cell relative to a new cell of the rated capacity, both discharged in five hours.
-pub fn energy_health(config: &OutlookConfig, cell: &CellState<'_>) -> ScalarGaussian {
+/// Energy of the full cell relative to a new cell of the rated capacity, both discharged at a usual load, C/2.
+pub fn energy_health(config: &OutlookConfig, cell: &CellNow<'_>) -> ScalarGaussian {
     let load = Load::constant(USUAL_LOAD_PER_H * cell.model.rated_capacity_ah);
     let exact = |mean: f64| ScalarGaussian { mean, variance: 0.0 };
-    let energy_wh = |cell: &CellState<'_>| {
-        let full = CellState { soc: exact(1.0), ..*cell };
+    let energy_wh = |cell: &CellNow<'_>| {
+        let full = CellNow { soc: exact(1.0), ..*cell };
         full.delivered_wh(full.dischargeable_ah(&load, config), &load)
     };
     let model = cell.model;
-    let new = CellState { capacity: exact(model.capacity_ah), log_resistance: exact(0.0), slow_ratio: 1.0, ..*cell };
+    let new = CellNow { capacity: exact(model.capacity_ah), log_resistance: exact(0.0), slow_ratio: 1.0, ..*cell };
     let new_wh = energy_wh(&new) * model.rated_capacity_ah / model.capacity_ah;
-    let aged = CellState { soc: exact(1.0), ..*cell }.spread(energy_wh);
+    let aged = CellNow { soc: exact(1.0), ..*cell }.spread(energy_wh);
     ScalarGaussian { mean: aged.mean / new_wh, variance: aged.variance / square(new_wh) }
 }
 

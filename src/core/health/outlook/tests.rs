@@ -1,3 +1,5 @@
+//! Compares the outlook with a simulated circuit, and its variances with the errors that cause them.
+
 use super::*;
 use crate::cell::Discretisation;
 use crate::cell::circuit::{BranchAt, soc_after, terminal_v};
@@ -12,9 +14,9 @@ const CONFIG: OutlookConfig = OutlookConfig {
     target_soc: 0.8,
 };
 
-fn cell(model: &CellModel, soc: f64) -> CellState<'_> {
+fn cell(model: &CellModel, soc: f64) -> CellNow<'_> {
     let exact = |mean: f64| ScalarGaussian { mean, variance: 0.0 };
-    CellState {
+    CellNow {
         model,
         soc: exact(soc),
         capacity: exact(2.0),
@@ -31,11 +33,11 @@ fn loaded(mode: Mode, current_a: f64) -> RecentLoad {
     load
 }
 
-fn of_one(cell: CellState<'_>, load: (Mode, f64)) -> Outlook {
+fn of_one(cell: CellNow<'_>, load: (Mode, f64)) -> Outlook {
     limited(cell, load, &CONFIG)
 }
 
-fn limited(cell: CellState<'_>, (mode, current_a): (Mode, f64), config: &OutlookConfig) -> Outlook {
+fn limited(cell: CellNow<'_>, (mode, current_a): (Mode, f64), config: &OutlookConfig) -> Outlook {
     let pack = Structure { series_per_state: 1.0, strings: 1.0, soc: cell.soc.mean, capacity_ah: cell.capacity.mean };
     of_pack(config, (&loaded(mode, current_a), mode), &[cell], &pack).unwrap()
 }
@@ -144,23 +146,43 @@ fn weakest_and_fullest_cell_limit_pack() {
 }
 
 #[test]
-fn variance_agrees_with_changed_states() {
-    let model = CellModel { voltage_min_v: 3.2, ..small_model() };
-    let spread = CellState {
-        soc: ScalarGaussian::from_std(0.6, 0.02),
-        capacity: ScalarGaussian::from_std(2.0, 0.05),
-        log_resistance: ScalarGaussian::from_std(0.0, 0.1),
-        ..cell(&model, 0.6)
+fn each_error_widens_what_depends_on_it() {
+    let model = small_model();
+    let exact = cell(&model, 0.6);
+    let of = |change: fn(&mut CellNow<'_>)| {
+        let mut cell = exact;
+        change(&mut cell);
+        of_one(cell, (Mode::Discharge, 1.0))
     };
-    let (load, config) = (Load { mean_a: 1.0, mean_square_a2: 2.0, peak_a: 3.0 }, &CONFIG);
-    let numeric = spread.spread(|cell| cell.remaining(&load, config)[1].mean);
-    let by_load = CellState { log_resistance: ScalarGaussian::from_std(0.0, LOG_LOAD_STD), ..cell(&model, 0.6) };
-    let by_load = by_load.spread(|cell| cell.remaining(&load, config)[1].mean).variance;
-    near(spread.remaining(&load, config)[1].variance, numeric.variance + by_load, 0.1);
-    for direction in [Direction::Discharge, Direction::Charge] {
-        let numeric = spread.spread(|cell| cell.limit_a(direction, 10.0, config).mean);
-        near(spread.limit_a(direction, 10.0, config).variance, numeric.variance, 0.15);
-    }
+    let known = of(|_| {});
+    // The load alone is unknown: 1.2 Ah at 1 A through 0.08 to 0.12 ohm.
+    near(known.remaining_wh.std(), LOG_LOAD_STD * 1.2 * 0.09, 0.1);
+    near(known.to_empty_s.unwrap().std(), LOG_LOAD_STD * 1.2 * 3600.0, 0.01);
+    assert!(known.discharge_w.iter().chain(&known.charge_w).all(|power| power.variance == 0.0));
+    let more = |widened: &Outlook| (widened.remaining_wh.variance - known.remaining_wh.variance).sqrt();
+    near(more(&of(|cell| cell.soc.variance = square(0.02))), 0.02 * 2.0 * (3.0 + 1.2 * 0.6), 0.05);
+    near(more(&of(|cell| cell.capacity.variance = square(0.1))), 0.05 * known.remaining_wh.mean, 0.05);
+    let by_resistance = of(|cell| cell.log_resistance.variance = square(0.1));
+    near(by_resistance.discharge_w[1].std(), 0.1 * known.discharge_w[1].mean, 0.15);
+    // At the end of the scale, the error lies on one side.
+    let empty = of(|cell| (cell.soc.mean, cell.soc.variance) = (0.0, square(0.02)));
+    near(empty.remaining_wh.std(), 0.02 * 2.0 * 2.9, 0.05);
+}
+
+#[test]
+fn charge_counts_after_minute_and_ends_at_weak_charger() {
+    let model = small_model();
+    let pack = Structure { series_per_state: 1.0, strings: 1.0, soc: 0.5, capacity_ah: 2.0 };
+    let time_s = |seconds: u32, current_a: f64| {
+        let mut load = RecentLoad::default();
+        (0..=seconds).for_each(|second| {
+            load.observe(Timestamp::from_secs(f64::from(second)), Mode::Charge, Some(-current_a), 0.01);
+        });
+        of_pack(&CONFIG, (&load, Mode::Charge), &[cell(&model, 0.5)], &pack).unwrap().to_full_s
+    };
+    assert_eq!(time_s(59, 1.0), None, "braking");
+    // The charger is weaker than the taper current of 0.1 A, so the charge ends when it reaches the voltage.
+    near(time_s(60, 0.05).unwrap().mean, 3600.0 * (1.0 - 0.05 * 0.08 / 1.2 / 2.0) / 0.05, 0.01);
 }
 
 #[test]

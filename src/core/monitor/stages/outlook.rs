@@ -2,8 +2,9 @@
 //! view.
 
 use super::Stages;
+use crate::cell::ModelBands;
 use crate::filter::ScalarGaussian;
-use crate::health::outlook::{CellState, Outlook, Structure, energy_health, of_pack};
+use crate::health::outlook::{CellNow, Outlook, Structure, energy_health, of_pack};
 use crate::sample::VoltageSource;
 
 impl Stages {
@@ -29,17 +30,20 @@ impl Stages {
     }
 
     /// State from which the outlook of a cell is computed; `None` before its first estimate, or without a temperature.
-    pub(crate) fn cell_state(&self, index: usize) -> Option<CellState<'_>> {
+    pub(crate) fn cell_state(&self, index: usize) -> Option<CellNow<'_>> {
         let bank = &self.estimation.bank;
-        let estimator = bank.cell(index);
-        Some(CellState {
+        let (soc, temperature_c, estimator) = (bank.soc(index)?, bank.temperature_c(index)?, bank.cell(index));
+        // The filter learns one ratio for all SOC and temperatures; the model's error at this point remains.
+        let local = ModelBands::new(bank.model(index)).resistance(soc.mean, temperature_c).local;
+        let of_cell = estimator.log_resistance();
+        Some(CellNow {
             model: bank.model(index),
-            soc: bank.soc(index)?,
+            soc,
             capacity: self.learning.capacity(index),
-            log_resistance: estimator.log_resistance(),
+            log_resistance: ScalarGaussian { variance: of_cell.variance + local * local, ..of_cell },
             slow_ratio: estimator.slow_ratio(bank.config(index)).mean,
             branch_v: estimator.branch_v(),
-            temperature_c: bank.temperature_c(index)?,
+            temperature_c,
         })
     }
 }
