@@ -372,6 +372,7 @@ impl Stages {
         self.sending.poll_with(now, out, |poller, _| poller.restart());
         self.publisher(now, out).apply(AlarmInput::Gap);
         self.learning.state.recharge.interrupt();
+        self.learning.state.load.interrupt();
         self.estimation.bank.change_all(|_, cell| cell.note_sleep());
         self.forget_pack_state();
     }

@@ -59,6 +59,7 @@ pub(crate) struct LearningState {
     pub(crate) recharge: RechargeTimer,
     pub(crate) recharge_period_s: Option<f64>,
     pub(crate) normalised_recharge: Option<ScalarGaussian>,
+    #[serde(default)]
     pub(crate) load: RecentLoad,
     pub(crate) pack: Option<PackState>,
 }

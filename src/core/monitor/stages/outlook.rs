@@ -2,8 +2,8 @@
 //! view.
 
 use super::Stages;
-use crate::cell::ModelBands;
-use crate::filter::ScalarGaussian;
+use crate::cell::{ModelBands, arrhenius};
+use crate::filter::{ScalarGaussian, square};
 use crate::health::outlook::{CellNow, Outlook, Structure, energy_health, of_pack};
 use crate::sample::VoltageSource;
 
@@ -36,11 +36,15 @@ impl Stages {
         // The filter learns one ratio for all SOC and temperatures; the model's error at this point remains.
         let local = ModelBands::new(bank.model(index)).resistance(soc.mean, temperature_c).local;
         let of_cell = estimator.log_resistance();
+        // Outside of its table, the model has the resistance of the nearest temperature.
+        let temperatures_c = &bank.model(index).temperature_c;
+        let nearest_c = temperature_c.max(temperatures_c[0]).min(temperatures_c[temperatures_c.len() - 1]);
+        let outside = libm::log(arrhenius(temperature_c) / arrhenius(nearest_c));
         Some(CellNow {
             model: bank.model(index),
             soc,
             capacity: self.learning.capacity(index),
-            log_resistance: ScalarGaussian { variance: of_cell.variance + local * local, ..of_cell },
+            log_resistance: ScalarGaussian { variance: of_cell.variance + square(local) + square(outside), ..of_cell },
             slow_ratio: estimator.slow_ratio(bank.config(index)).mean,
             branch_v: estimator.branch_v(),
             temperature_c,
