@@ -204,7 +204,9 @@ async fn answer(request: &Request<Incoming>, site: &Site, activity: &Activity, e
         Decision::Allowed => {}
         Decision::SetCookie(cookie) => {
             let moved = respond(StatusCode::SEE_OTHER, PLAIN, "the token is accepted\n");
-            return with(with(moved, LOCATION, path), SET_COOKIE, &cookie);
+            // Two slashes would begin the name of another host.
+            let own = format!("/{}", path.trim_start_matches('/'));
+            return with(with(moved, LOCATION, &own), SET_COOKIE, &cookie);
         }
         Decision::NeedsToken => {
             let refused = respond(StatusCode::UNAUTHORIZED, PLAIN, NEEDS_TOKEN);
@@ -249,7 +251,7 @@ fn with(mut answer: Answer, name: HeaderName, value: &str) -> Answer {
 async fn report(site: &Site) -> Answer {
     let Some(make) = site.report else { return respond(StatusCode::NOT_FOUND, PLAIN, NO_REPORT) };
     let store = site.live.document().await.and_then(|document| document.store);
-    let folder = store.map(|store| PathBuf::from(store.path));
+    let folder = store.filter(|store| !store.path.is_empty()).map(|store| PathBuf::from(store.path));
     let Some(folder) = folder else { return respond(StatusCode::NOT_FOUND, PLAIN, "no daemon with a store answers\n") };
     let Ok(permit) = Arc::clone(&site.report_permit).acquire_owned().await else {
         return respond(StatusCode::SERVICE_UNAVAILABLE, PLAIN, "the exporter stops\n");

@@ -1,9 +1,9 @@
-//! Decides who may read: everyone on this computer, or those who know the token.
+//! Decides who may read: everyone on this computer, or whoever knows the token.
 //!
 //! | address | without a token | with a token |
 //! | --- | --- | --- |
-//! | of this computer | everything | everything, with the token |
-//! | of a network | metrics only | everything, with the token |
+//! | loopback | everything | everything, with the token |
+//! | any other | metrics only | everything, with the token |
 //!
 //! A client sends the token as `Authorization: Bearer TOKEN`, or once as `?token=TOKEN`. In the second case the answer
 //! sets a cookie and redirects to the address without the token, so that the token does not stay in the browser's
@@ -63,17 +63,20 @@ impl Access {
         let path = request.uri().path();
         let header = |name| request.headers().get_all(name).iter().filter_map(|value| value.to_str().ok());
         let Some(token) = self.token.as_deref().filter(|_| path != "/-/healthy") else {
-            let is_local = self.is_local && header(HOST).all(is_numeric);
+            let mut hosts = request.headers().get_all(HOST).iter();
+            let is_local = self.is_local && hosts.all(|host| host.to_str().is_ok_and(is_numeric));
             let is_open = is_local || matches!(path, "/metrics" | "/-/healthy");
             return if is_open { Decision::Allowed } else { Decision::OnlyLocal };
         };
         let query = request.uri().query().unwrap_or_default();
         if query.split('&').filter_map(|pair| pair.strip_prefix("token=")).any(|given| is_equal(given, token)) {
-            return Decision::SetCookie(format!("{COOKIE_NAME}={token}; Path=/; HttpOnly; SameSite=Lax"));
+            return Decision::SetCookie(format!(
+                "{COOKIE_NAME}={token}; Path=/; Max-Age=31536000; HttpOnly; SameSite=Lax"
+            ));
         }
         let bearer = header(AUTHORIZATION).filter_map(|value| value.split_once(' '));
         let mut bearer = bearer.filter(|(scheme, _)| scheme.eq_ignore_ascii_case("bearer")).map(|(_, given)| given);
-        let cookies = header(COOKIE).flat_map(|value| value.split("; ").filter_map(|pair| pair.split_once('=')));
+        let cookies = header(COOKIE).flat_map(|value| value.split(';').filter_map(|pair| pair.trim().split_once('=')));
         let mut cookies = cookies.filter(|(name, _)| *name == COOKIE_NAME).map(|(_, given)| given);
         let is_known = bearer.any(|given| is_equal(given, token)) || cookies.any(|given| is_equal(given, token));
         if is_known { Decision::Allowed } else { Decision::NeedsToken }

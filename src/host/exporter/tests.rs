@@ -49,6 +49,7 @@ impl FakeDaemon {
         let listener = UnixListener::bind(&socket).unwrap();
         let daemon = Self { document: Arc::new(Mutex::new(Some(document))), connections: Arc::default(), socket };
         let (document, connections) = (Arc::clone(&daemon.document), Arc::clone(&daemon.connections));
+        let began = Instant::now();
         thread::spawn(move || {
             for stream in listener.incoming() {
                 let (mut stream, document) = (stream.unwrap(), Arc::clone(&document));
@@ -56,7 +57,9 @@ impl FakeDaemon {
                 thread::spawn(move || {
                     loop {
                         let document = document.lock().unwrap().clone();
-                        let Some(document) = document else { return };
+                        let Some(mut document) = document else { return };
+                        let elapsed = i64::try_from(began.elapsed().as_nanos()).unwrap();
+                        document.time = document.time.plus_nanos(elapsed);
                         let line = serde_json::to_string(&document).unwrap() + "\n";
                         if stream.write_all(line.as_bytes()).is_err() {
                             return;
@@ -159,7 +162,7 @@ fn token_opens_every_path_but_liveness() {
     }
     assert!(get(address, "/-/healthy", "").starts_with("HTTP/1.1 200"));
     let moved = get(address, "/?token=0123456789abcdef", "");
-    let cookie = "set-cookie: packwatch_token=0123456789abcdef; Path=/; HttpOnly; SameSite=Lax";
+    let cookie = "set-cookie: packwatch_token=0123456789abcdef; Path=/; Max-Age=31536000; HttpOnly; SameSite=Lax";
     assert!(
         moved.starts_with("HTTP/1.1 303") && moved.contains("location: /\r\n") && moved.contains(cookie),
         "{moved}"
