@@ -195,7 +195,9 @@ fn health(raw: &RawTables, model: Option<&CellModel>) {
             estimator.place.fault("capacity_state", format!("must be \"{needed}\" with capacity.method = \"{key}\""));
         }
     }
-    if let (Some(outlook), Some(model)) = (&raw.outlook, model) {
+    // If the model's own range is invalid, only the model's fault is reported.
+    let has_range = |model: &&CellModel| model.voltage_min_v < model.voltage_max_v;
+    if let (Some(outlook), Some(model)) = (&raw.outlook, model.filter(has_range)) {
         let min_v = outlook.min_voltage_v.unwrap_or(model.voltage_min_v);
         let [low_v, high_v] = [0.5 * model.voltage_min_v, model.voltage_max_v + 0.5];
         if !(low_v..model.voltage_max_v).contains(&min_v) {
