@@ -11,6 +11,7 @@ pub mod config;
 pub mod coverage;
 pub mod electrodes;
 pub mod estimator;
+pub mod fleet_prior;
 pub mod loss_modes;
 pub mod model;
 pub mod model_bands;
@@ -31,6 +32,7 @@ pub use estimator::{
     AdoptedState, CellEstimator, CellModule, CellState, CellStep, EstimatorBank, PackBank, StepResult, Update,
     reach_of_error,
 };
+pub use fleet_prior::FleetPrior;
 pub use loss_modes::LossModes;
 pub use model::{
     Branch, CellModel, ERROR_WINDOW_S, GridPosition, MAX_BRANCHES, ModelSpread, Table, TemperaturePosition, Thermal,
