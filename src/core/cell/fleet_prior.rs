@@ -3,11 +3,12 @@
 //! In: one [`OwnModel`] per vehicle. Out: a [`FleetPrior`], which replaces the values that are typical of the chemistry.
 //!
 //! Each quantity (the curve at each SOC, a resistance, the capacity) varies between the cells of the label with an unknown
-//! covariance P. A vehicle's fit gives the mean m and the posterior covariance V; it started from the label's covariance
-//! L. The covariance of the means over the vehicles contains the part of P that the data showed, and the errors of the
-//! fits. The data did not show the part V L^-1 V, which is the share of the label's uncertainty in V (Joseph's form of
-//! the update). The estimate of P is the sum of both. Few vehicles say little about P, so the label's covariance counts
-//! as [`LABEL_VEHICLES`] more vehicles.
+//! variance P. A vehicle's fit gives the mean m and the posterior variance V; it started from the label's variance L. The
+//! variance of the means over the vehicles contains the part of P that the data showed, and the errors of the fits. The
+//! data did not show the part V^2 / L, which is the share of the label's uncertainty in V (Joseph's form of the update).
+//! The estimate of P is the sum of both. For the curve, L is a covariance between the SOC, and each vehicle scales it at
+//! each SOC by V / L. Few vehicles say little about P, so the label's covariance counts as [`LABEL_VEHICLES`] more
+//! vehicles.
 
 use nalgebra::DMatrix;
 use serde::{Deserialize, Serialize};
@@ -95,15 +96,16 @@ impl FleetPrior {
         let mut covariance = LABEL_VEHICLES * &label.covariance;
         let mean_v: Vec<f64> =
             (0..SOC_NODES).map(|s| vehicles.iter().map(|own| own.curve_v[s]).sum::<f64>() / count).collect();
-        let to_information = information(&label.covariance)?;
         for own in vehicles {
-            let posterior = DMatrix::from_fn(SOC_NODES, SOC_NODES, |a, b| {
-                let modes: f64 = own.modes_v.iter().map(|mode_v| mode_v[a] * mode_v[b]).sum();
-                modes + if a == b { own.rest_v[a] * own.rest_v[a] } else { 0.0 }
-            });
-            covariance += &posterior * &to_information * &posterior;
+            // Share of the label's variance that the vehicle's data left.
+            let share = |s: usize| {
+                let modes: f64 = own.modes_v.iter().map(|mode_v| mode_v[s] * mode_v[s]).sum();
+                ((modes + own.rest_v[s] * own.rest_v[s]) / label.covariance[(s, s)]).min(1.0)
+            };
+            let shares: [f64; SOC_NODES] = std::array::from_fn(share);
             covariance += DMatrix::from_fn(SOC_NODES, SOC_NODES, |a, b| {
-                (own.curve_v[a] - mean_v[a]) * (own.curve_v[b] - mean_v[b])
+                let unseen = shares[a] * label.covariance[(a, b)] * shares[b];
+                unseen + (own.curve_v[a] - mean_v[a]) * (own.curve_v[b] - mean_v[b])
             });
         }
         covariance /= count + LABEL_VEHICLES;

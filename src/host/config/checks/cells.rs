@@ -74,8 +74,10 @@ pub(crate) fn fleet_prior(path: &Path, pack: &Pack, read: ReadFile<'_>) -> Optio
     let file = beside(path, named);
     let parsed = read(&file).map_err(|error| error.to_string()).and_then(|bytes| {
         let text = String::from_utf8(bytes).map_err(|error| error.to_string())?;
-        let prior: FleetPrior =
-            toml::from_str(&text).map_err(|error| error.to_string().trim_end().replace('\n', " "))?;
+        let table: toml::Table = text.parse().map_err(|error: toml::de::Error| error.message().to_owned())?;
+        // The program reads stored models from JSON; a second reader would make it larger.
+        let json = serde_json::to_vec(&table).map_err(|error| error.to_string())?;
+        let prior: FleetPrior = serde_json::from_slice(&json).map_err(|error| error.to_string())?;
         prior.check().map_err(|error| error.to_string())?;
         Ok(prior)
     });
