@@ -18,6 +18,7 @@ const UPLINK: &[(&str, &str, &str, &str, &str)] = &[
     ("queue_bytes", "Uplink Queue Size", "B", "data_size", "measurement"),
     ("dropped_samples", "Uplink Dropped Samples", "", "", "total_increasing"),
     ("dropped_events", "Uplink Dropped Events", "", "", "total_increasing"),
+    ("missed_events", "Uplink Missed Events", "", "", "total_increasing"),
 ];
 
 /// Every discovery message.
