@@ -30,6 +30,9 @@ pub fn messages(settings: &MqttSettings, document: &StatusDocument) -> Vec<Messa
         if entity.is_diagnostic {
             config["entity_category"] = "diagnostic".into();
         }
+        if !entity.is_enabled {
+            config["enabled_by_default"] = false.into();
+        }
         device.message("sensor", &entity.key, &config)
     });
     let alarms = document.alarms.rules.iter().map(|rule| device.alarm(rule.name()));
@@ -124,6 +127,7 @@ impl<'a> Device<'a> {
         let key = format!("battery_voltage_cell{number}");
         let mut config = self.entity(&name, &key, topic::CELLS, &format!("cell_voltages_mv[{index}]"));
         describe(&mut config, Kind::Measured { unit: "mV", class: "voltage", decimals: 0 });
+        config["enabled_by_default"] = false.into();
         self.message("sensor", &format!("cell_voltage{number}"), &config)
     }
 
