@@ -64,7 +64,7 @@ struct PlanArgs {
 #[command(
     after_help = "Writes DIR/VEHICLE/half_cycles.parquet, alarms.parquet, with --estimates estimates.parquet, and last vehicle.json. Vehicles that have \
     vehicle.json are not replayed again, so a stopped run can be continued. If a vehicle fails, the run reports it and continues; the next run tries \
-    it again. The exit code is 0 if every vehicle was replayed or its failure was recorded."
+    it again. The exit code is 0 if every vehicle was replayed, 1 if a vehicle failed."
 )]
 struct RunArgs {
     /// Manifest to read
@@ -183,7 +183,11 @@ fn replay(args: &RunArgs) -> Result<(), Failure> {
     let outcomes = vehicles::run(&chosen, &config_of, &settings, &|bytes| bar.inc(bytes));
     bar.finish_and_clear();
     let outcomes = outcomes.map_err(failure)?;
-    unless_closed(if args.json { print_json(&document(&outcomes)) } else { summary(&outcomes, args.shard) })
+    unless_closed(if args.json { print_json(&document(&outcomes)) } else { summary(&outcomes, args.shard) })?;
+    match outcomes.iter().filter(|outcome| matches!(outcome, Outcome::Failed(_))).count() {
+        0 => Ok(()),
+        failed => Err(Failure::new(format!("{failed} of {} vehicles failed", outcomes.len()))),
+    }
 }
 
 fn document(outcomes: &[Outcome]) -> serde_json::Value {

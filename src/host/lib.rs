@@ -7,6 +7,7 @@ pub mod config;
 pub mod control;
 pub mod exporter;
 pub mod failure;
+pub mod http;
 pub mod io;
 pub mod logging;
 pub mod replay;

@@ -13,6 +13,8 @@ VSS = {
     "CellVoltage.Min": "float", "CellVoltage.IdMin": "uint16", "CellVoltage.Max": "float", "CellVoltage.IdMax": "uint16",
     "CellVoltage.CellVoltages": "float[]", "StateOfCharge.Current": "float", "StateOfCharge.CurrentEnergy": "float",
     "Charging.TimeToComplete": "uint32", "StateOfHealth": "float", "ErrorCodes": "string[]",
+    "TimeRemaining": "uint32", "AccumulatedChargedThroughput": "float", "AccumulatedConsumedThroughput": "float",
+    "AccumulatedChargedEnergy": "float", "AccumulatedConsumedEnergy": "float", "TotalEnergyThroughput": "uint64",
     # Signals of VSS that packwatch does not provide.
     "NetCapacity": "uint16", "StateOfCharge.Displayed": "float", "Charging.IsCharging": "boolean", "Range": "uint32",
 }
@@ -61,6 +63,12 @@ def standard(document):
         "Charging.TimeToComplete": None if pack["time_to_full_s"] is None else round(single(pack["time_to_full_s"])),
         "StateOfHealth": None if (pack["soh"] or 0) > 1 else scaled(pack["soh"], 100.0),
         "ErrorCodes": codes,
+        "TimeRemaining": None if pack["time_to_empty_s"] is None else round(pack["time_to_empty_s"]),
+        "AccumulatedChargedThroughput": single(pack["moved"]["charged_ah"]),
+        "AccumulatedConsumedThroughput": single(pack["moved"]["discharged_ah"]),
+        "AccumulatedChargedEnergy": scaled(pack["moved"]["charged_wh"], 1e-3),
+        "AccumulatedConsumedEnergy": scaled(pack["moved"]["discharged_wh"], 1e-3),
+        "TotalEnergyThroughput": round(pack["moved"]["charged_wh"] + pack["moved"]["discharged_wh"]),
     }
 
 

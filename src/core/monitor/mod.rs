@@ -53,6 +53,7 @@ pub use snapshot::{RestoreError, Snapshot};
 pub use stage::intake::ControllerCount;
 pub use stage::intake::command_gate::CommandCounts;
 pub use stage::learning::Throughput;
+pub use stage::learning::moved::MovedSums;
 pub use stage::modelling::{ModelChange, ModelView};
 pub use stage::sending::MAX_TEST_S;
 pub use stage::statistics::{AlarmCounts, BusStatistics, LearningCounts, Statistics, VoltageCounts};

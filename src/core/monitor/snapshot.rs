@@ -119,6 +119,7 @@ impl Snapshot {
         restarted.sampling.restart();
         restarted.estimation.is_current_doubtful = false;
         restarted.learning.load.interrupt();
+        restarted.learning.moved = restarted.learning.moved.interrupted();
         restarted.estimation.current_check.interrupt();
         restarted.modelling.iter_mut().for_each(ModellingState::restart);
         restarted.diagnosis.iter_mut().for_each(CellFaultDetector::interrupt);

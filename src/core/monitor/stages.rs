@@ -227,6 +227,7 @@ impl Stages {
         let rest_a = config.transition.dead_band_a / strings;
         let mode = state.detector.mode();
         state.load.observe(now, mode, current_a.map(|pack_a| pack_a / strings), rest_a);
+        state.moved.observe(now, current_a, || self.sampling.pack_voltage_v(self.estimation.cell_indices(), now));
         if observed.change.is_none() && !observed.candidate_begins {
             return;
         }

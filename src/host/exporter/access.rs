@@ -9,8 +9,7 @@
 //! sets a cookie and redirects to the address without the token, so that the token does not stay in the browser's
 //! history. The liveness check needs no token.
 //!
-//! Without a token, the page must be requested by a numeric address or as `localhost`. Otherwise a foreign page in a
-//! browser on this computer could read it under a name that it lets point to this computer (DNS rebinding).
+//! Without a token, the request must name this computer ([`names_this_computer`]).
 
 use std::fs;
 use std::hint::black_box;
@@ -18,7 +17,9 @@ use std::net::IpAddr;
 use std::path::Path;
 
 use hyper::Request;
-use hyper::header::{AUTHORIZATION, COOKIE, HOST};
+use hyper::header::{AUTHORIZATION, COOKIE};
+
+use crate::http::names_this_computer;
 
 /// Fewest characters of a token. 16 hexadecimal digits are 64 bits.
 const MIN_TOKEN: usize = 16;
@@ -63,8 +64,7 @@ impl Access {
         let path = request.uri().path();
         let header = |name| request.headers().get_all(name).iter().filter_map(|value| value.to_str().ok());
         let Some(token) = self.token.as_deref().filter(|_| path != "/-/healthy") else {
-            let mut hosts = request.headers().get_all(HOST).iter();
-            let is_local = self.is_local && hosts.all(|host| host.to_str().is_ok_and(is_numeric));
+            let is_local = self.is_local && names_this_computer(request);
             let is_open = is_local || matches!(path, "/metrics" | "/-/healthy");
             return if is_open { Decision::Allowed } else { Decision::OnlyLocal };
         };
@@ -81,13 +81,6 @@ impl Access {
         let is_known = bearer.any(|given| is_equal(given, token)) || cookies.any(|given| is_equal(given, token));
         if is_known { Decision::Allowed } else { Decision::NeedsToken }
     }
-}
-
-/// Whether a host with an optional port is a numeric address or `localhost`.
-fn is_numeric(host: &str) -> bool {
-    let name = host.rsplit_once(':').filter(|(_, port)| port.bytes().all(|byte| byte.is_ascii_digit()));
-    let name = name.map_or(host, |(name, _)| name);
-    name == "localhost" || name.trim_matches(['[', ']']).parse::<IpAddr>().is_ok()
 }
 
 /// Compares in a time that does not depend on the position of the first difference.

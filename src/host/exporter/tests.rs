@@ -5,10 +5,16 @@ mod browser;
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::os::unix::net::UnixListener;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, mpsc};
+use std::sync::{Mutex, mpsc};
 use std::thread;
+use std::time::Duration;
+
+use hyper::header::HeaderValue;
+use tokio::net::TcpStream;
+use tokio::time::sleep;
 
 use super::*;
+use crate::http::MAX_CONNECTIONS;
 use crate::status::document::StatusDocument;
 use crate::status::sample::sample;
 use crate::status::stream_path;
