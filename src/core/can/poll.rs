@@ -158,6 +158,26 @@ pub struct PollProgress {
     silence: Option<PollSilence>,
 }
 
+impl PollProgress {
+    /// Shifts the time that a restart needs to another clock.
+    pub(crate) fn rebase(&mut self, by_nanos: i64) {
+        self.foreign_until = self.foreign_until.plus_nanos(by_nanos);
+    }
+
+    /// Drops everything that ends with the process. Returns `false` if nothing is left: neither standby nor the silence
+    /// after another tester.
+    pub(crate) fn restart(&mut self, now: Timestamp) -> bool {
+        (self.outstanding, self.latest, self.silence) = (None, None, None);
+        self.items.clear();
+        self.heard.clear();
+        self.is_standby || self.hears_tester(now)
+    }
+
+    fn hears_tester(&self, now: Timestamp) -> bool {
+        now < self.foreign_until
+    }
+}
+
 impl Poller {
     /// Creates a poller that has received nothing yet and is therefore silent.
     pub fn new(config: &PollConfig) -> Self {
@@ -185,6 +205,15 @@ impl Poller {
     /// The progress to store.
     pub fn progress(&self) -> &PollProgress {
         &self.progress
+    }
+
+    /// Restores standby and the silence after another tester, for example after a restart. The tester may have sent
+    /// further requests in the meantime, so its silence starts anew. `taken`: time of the stored progress.
+    pub fn restore_silence(&mut self, stored: &PollProgress, taken: Timestamp, now: Timestamp) {
+        self.progress.is_standby = stored.is_standby;
+        if stored.hears_tester(taken) {
+            self.progress.foreign_until = now.plus_nanos(FOREIGN_SILENCE_NS);
+        }
     }
 
     /// Resumes stored progress, if it belongs to the same configuration.
@@ -368,7 +397,7 @@ impl Poller {
         let is_asleep = |(_, at): &(BusIndex, Timestamp)| now.nanos().saturating_sub(at.nanos()) >= ASLEEP_AFTER_NS;
         if self.progress.is_standby {
             Some(PollSilence::Standby)
-        } else if now < self.progress.foreign_until {
+        } else if self.progress.hears_tester(now) {
             Some(PollSilence::OtherTester)
         } else if self.config.watches_supply && now >= self.progress.supply_good_until {
             Some(PollSilence::LowSupply)
@@ -451,12 +480,14 @@ impl Poller {
     }
 }
 
-/// Whether the identifier is one of the request identifiers of ISO 15765-4 (physical or functional), which only testers
-/// use.
+/// Whether only testers use this identifier: the request identifiers of ISO 15765-4 (physical or functional), and those
+/// of BMW (6F1), Volkswagen (710, 17FC00xx) and Renault-Nissan (743).
 fn is_tester(id: CanId) -> bool {
     match id {
-        CanId::Standard(raw) => raw == 0x7DF || (0x7E0..=0x7E7).contains(&raw),
-        CanId::Extended(raw) => matches!(raw & 0x1FFF_00FF, 0x18DA_00F1 | 0x18DB_00F1),
+        CanId::Standard(raw) => matches!(raw, 0x7DF..=0x7E7 | 0x6F1 | 0x710 | 0x743),
+        CanId::Extended(raw) => {
+            matches!(raw & 0x1FFF_00FF, 0x18DA_00F1 | 0x18DB_00F1) || raw & 0x1FFF_FF00 == 0x17FC_0000
+        }
     }
 }
 

@@ -124,7 +124,8 @@ fn requests_keep_period_and_responses_get_flow_control() {
 
 #[test]
 fn polling_pauses_one_minute_after_other_tester() {
-    for foreign in [REQUEST, CanId::Standard(0x7DF), CanId::Standard(0x7E0), CanId::Extended(0x18DA_10F1)] {
+    let standard = [0x7DF, 0x7E0, 0x6F1, 0x710, 0x743].map(CanId::Standard);
+    for foreign in [REQUEST, CanId::Extended(0x18DA_10F1), CanId::Extended(0x17FC_007B)].into_iter().chain(standard) {
         let mut bench = Bench::new(vec![request(1, 0.5)]);
         bench.run(2000);
         bench.hear(foreign, &[2, 0x3E, 0, 0, 0, 0, 0, 0]);
@@ -196,6 +197,47 @@ fn standby_stops_polling() {
     bench.poller.set_standby(false);
     bench.run(1000);
     assert!(!bench.requests().is_empty());
+}
+
+/// A poller after a restart at `at_ms` from the progress of `bench`, in a moving car with an awake bus.
+fn restarted(bench: &Bench, at_ms: i64) -> Bench {
+    let mut stored = bench.poller.progress().clone();
+    let taken = at(bench.now_ms);
+    let mut next = Bench::new(vec![request(1, 0.5)]);
+    next.now_ms = at_ms;
+    if stored.restart(taken) {
+        stored.rebase(at(at_ms).nanos() - taken.nanos());
+        next.poller.restore_silence(&stored, at(at_ms), at(at_ms));
+    }
+    next
+}
+
+#[test]
+fn standby_and_silence_after_tester_survive_restart() {
+    let mut bench = Bench::new(vec![request(1, 0.5)]);
+    bench.run(2000);
+    let mut next = restarted(&bench, 0);
+    next.run(1000);
+    assert!(!next.requests().is_empty(), "neither standby nor a tester");
+    bench.poller.set_standby(true);
+    let mut next = restarted(&bench, 5000);
+    next.run(100_000);
+    assert_eq!(next.requests(), []);
+    next.poller.set_standby(false);
+    next.run(1000);
+    assert!(!next.requests().is_empty());
+    bench.poller.set_standby(false);
+    bench.hear(CanId::Standard(0x7DF), &[2, 0x3E, 0, 0, 0, 0, 0, 0]);
+    bench.run(50_000);
+    for at_ms in [0, 500_000] {
+        let mut next = restarted(&bench, at_ms);
+        next.run(59_999);
+        assert_eq!(next.requests(), [], "{at_ms}");
+        next.run(1000);
+        assert!(!next.requests().is_empty(), "{at_ms}");
+    }
+    bench.run(20_000);
+    assert!(!bench.poller.progress().clone().restart(at(bench.now_ms)), "nothing is left to store");
 }
 
 #[test]

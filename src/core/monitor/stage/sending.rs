@@ -68,9 +68,17 @@ pub(crate) struct SendingState {
 }
 
 impl SendingState {
-    /// Drops everything that ends with the process: a test, diagnostic requests and the J1939 address.
-    pub(crate) fn restart(&mut self) {
-        (self.test, self.poller, self.node) = (None, None, None);
+    /// Drops everything that ends with the process: a test, diagnostic requests and the J1939 address. Standby and the
+    /// silence after another tester remain.
+    pub(crate) fn restart(&mut self, now: Timestamp) {
+        (self.test, self.node) = (None, None);
+        self.poller.take_if(|poller| !poller.restart(now));
+    }
+
+    /// Shifts stored times to another clock.
+    pub(crate) fn rebase(&mut self, by_nanos: i64) {
+        self.schedule.rebase(by_nanos);
+        self.poller.iter_mut().for_each(|poller| poller.rebase(by_nanos));
     }
 }
 
@@ -171,6 +179,13 @@ impl Sending {
             test: self.test,
             poller: self.poller.as_ref().map(|poller| poller.progress().clone()),
             node: self.j1939.as_ref().map(|j1939| j1939.node.clone()),
+        }
+    }
+
+    /// Restores what remains of the diagnostic requests after a restart. `taken`: time of the stored state.
+    pub(crate) fn restore_silence(&mut self, state: &SendingState, taken: Timestamp, now: Timestamp) {
+        if let (Some(poller), Some(stored)) = (&mut self.poller, &state.poller) {
+            poller.restore_silence(stored, taken, now);
         }
     }
 
