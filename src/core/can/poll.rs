@@ -55,7 +55,7 @@ pub struct PollRequest {
 pub struct PollConfig {
     /// Requests. If several are due at the same time, the first of them in this list is sent first.
     pub requests: Vec<PollRequest>,
-    /// Maximum number of requests per second, over all requests.
+    /// Maximum number of sent frames (requests and flow control) per second, over all requests.
     pub max_requests_per_s: f64,
     /// Whether a supply voltage is configured. If so, nothing is sent without a good reading of the supply voltage.
     pub watches_supply: bool,
@@ -130,6 +130,9 @@ struct Outstanding {
     index: usize,
     sent: Timestamp,
     deadline: Timestamp,
+    /// Whether the response has received its flow control.
+    #[serde(default)]
+    has_flow_control: bool,
 }
 
 /// Sends diagnostic requests.
@@ -296,10 +299,16 @@ impl Poller {
         self.poll(now, out);
     }
 
-    /// Handles the first frame of a multi-frame response to the outstanding request: sends flow control.
+    /// Handles the first frame of a multi-frame response to the outstanding request: sends flow control, but only once
+    /// per request. A controller that sends further first frames gets no more answers; the listener counts their faults.
     pub fn handle_begun(&mut self, now: Timestamp, controller: &Controller, out: &mut PollOutputs) {
         let Some(question) = self.outstanding_of(controller) else { return };
+        let is_first = |outstanding: &mut Outstanding| !std::mem::replace(&mut outstanding.has_flow_control, true);
+        if !self.progress.outstanding.as_mut().is_some_and(is_first) {
+            return;
+        }
         self.extend_wait(now, ANSWER_WITHIN_NS);
+        self.progress.rate_allows_at = self.progress.rate_allows_at.max(now).plus_secs(self.frame_period_s());
         let Controller { bus, request, request_extension, .. } = question.controller;
         let mut payload = [0; 8];
         let bytes = request_extension.iter().chain(&FLOW_CONTROL);
@@ -417,6 +426,11 @@ impl Poller {
         waiting.map(|(index, item)| (index, item.due)).min_by_key(|(_, due)| *due)
     }
 
+    /// Shortest mean period of the sent frames, s.
+    fn frame_period_s(&self) -> f64 {
+        1.0 / self.config.max_requests_per_s
+    }
+
     fn period_s(&self, index: usize) -> Option<f64> {
         self.config.requests[index].every_s[self.progress.state as usize]
     }
@@ -445,9 +459,10 @@ impl Poller {
         let payload = segment(request_extension, &message, 0);
         out.frames
             .extend(payload.first().and_then(|payload| Frame::classic(request, payload)).map(|frame| (bus, frame)));
-        self.progress.outstanding = Some(Outstanding { index, sent: now, deadline: now.plus_nanos(ANSWER_WITHIN_NS) });
+        let deadline = now.plus_nanos(ANSWER_WITHIN_NS);
+        self.progress.outstanding = Some(Outstanding { index, sent: now, deadline, has_flow_control: false });
         self.progress.latest = Some(index);
-        self.progress.rate_allows_at = now.plus_secs(1.0 / self.config.max_requests_per_s);
+        self.progress.rate_allows_at = now.plus_secs(self.frame_period_s());
         // A request without a period in this state is sent only before a request for voltages.
         let period_s = self.period_s(index).unwrap_or(0.0);
         let item = &mut self.progress.items[index];

@@ -118,7 +118,7 @@ fn requests_keep_period_and_responses_get_flow_control() {
     bench.run(6050);
     let of = |id: u16| bench.requests().iter().filter(|(_, other)| *other == id).map(|(ms, _)| *ms).collect::<Vec<_>>();
     assert_eq!(of(1), [100, 1100, 2100, 3100, 4100, 5100], "periodic from the first frame on");
-    assert_eq!(of(2), [200, 3200], "after the other request, at ten requests a second");
+    assert_eq!(of(2), [300, 3300], "after the other request and its flow control, at ten frames a second");
     assert_eq!(bench.sent[..2], [(100, vec![3, 0x22, 0, 1, 0, 0, 0, 0]), (100, vec![0x30, 0, 0, 0, 0, 0, 0, 0])]);
 }
 
@@ -137,6 +137,20 @@ fn polling_pauses_one_minute_after_other_tester() {
         let reason = PollSilence::OtherTester;
         assert_eq!(bench.changes[1..], [(2000, PollChange::Silent { reason }), (62_000, PollChange::Asking)]);
     }
+}
+
+#[test]
+fn endless_first_frames_get_one_flow_control_per_request() {
+    let mut bench =
+        Bench::with(PollConfig { requests: vec![request(1, 0.1)], max_requests_per_s: 5.0, watches_supply: false });
+    bench.answer = |_| Behaviour::Nothing;
+    for _ in 0..12_000 {
+        bench.run(1);
+        bench.poller.handle_begun(at(bench.now_ms), &CONTROLLER, &mut bench.out);
+        bench.take();
+    }
+    let (sent, requests) = (bench.sent.len(), bench.requests().len());
+    assert!(requests > 1 && sent <= 2 * requests && sent <= 60, "{sent} frames for {requests} requests in 12 s");
 }
 
 #[test]
@@ -337,7 +351,8 @@ proptest! {
             bench.take();
             prop_assert!(bench.poller.next_due().is_none_or(|due| due > at(bench.now_ms)), "{:?}", bench.poller);
         }
-        let requests = bench.requests();
+        let (requests, sent) = (bench.requests(), bench.sent.len());
+        prop_assert!(sent <= 2 * requests.len() && i64::try_from(sent).unwrap() <= 2 + bench.now_ms / 100, "{sent} frames");
         prop_assert!(requests.windows(2).all(|pair| pair[1].0 - pair[0].0 >= 100), "{requests:?}");
     }
 }

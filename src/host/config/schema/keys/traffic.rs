@@ -13,7 +13,7 @@ section! {
     Poll at "poll" {
         /// Whether requests are sent.
         enabled: bool, "", Any, Default("false");
-        /// Largest number of requests per second, for all answers together.
+        /// Largest number of sent frames (requests and flow control) per second, for all answers together.
         max_requests_per_s: f64, "1/s", Between(0.01, 100.0), Default("10.0");
     }
 }
