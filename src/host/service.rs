@@ -155,6 +155,7 @@ impl Service {
             clock,
             clock_steps: StepDetector::new(start),
             batch: Vec::new(),
+            ticked: clock.now(),
             left_out_reported: Instant::now(),
             status_publisher,
             model_fit: None,

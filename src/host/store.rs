@@ -200,6 +200,7 @@ impl Store {
             state_files,
             knows_state: database.is_some() || !found.states.is_empty(),
             needs_state: true,
+            was_replaced: false,
             database,
             progress: sender,
             retry,

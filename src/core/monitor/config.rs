@@ -103,6 +103,8 @@ pub struct OutputConfig {
     pub alarm_period_s: f64,
     /// Period of the digest (all its pages) (s).
     pub digest_period_s: f64,
+    /// Whether cyclic frames are sent while the buses sleep. They would keep other nodes awake.
+    pub while_asleep: bool,
 }
 
 /// Configuration of the J1939 node.

@@ -146,6 +146,7 @@ impl Stages {
         self.sending.schedule = snapshot.sending.schedule.clone();
         if !is_continued {
             self.sending.begin_freshness(now);
+            self.sending.restore_silence(&snapshot.sending, snapshot.time, now);
         }
         self.sleep.since = snapshot.asleep_since;
         self.restore_alarms(now, &snapshot.alarming.alarms, is_continued, out);

@@ -53,6 +53,8 @@ pub(crate) struct Sending {
     supply: Option<SupplyConfig>,
     /// Whether an alarm change has changed the time at which work is next due.
     is_rescheduled: bool,
+    /// Whether cyclic frames are omitted, because the buses sleep.
+    is_quiet: bool,
     /// Buffer for the poller's outputs; reused to avoid allocations.
     polled: PollOutputs,
 }
@@ -68,9 +70,17 @@ pub(crate) struct SendingState {
 }
 
 impl SendingState {
-    /// Drops everything that ends with the process: a test, diagnostic requests and the J1939 address.
-    pub(crate) fn restart(&mut self) {
-        (self.test, self.poller, self.node) = (None, None, None);
+    /// Drops everything that ends with the process: a test, diagnostic requests and the J1939 address. Standby and the
+    /// silence after another tester remain.
+    pub(crate) fn restart(&mut self, now: Timestamp) {
+        (self.test, self.node) = (None, None);
+        self.poller.take_if(|poller| !poller.restart(now));
+    }
+
+    /// Shifts stored times to another clock.
+    pub(crate) fn rebase(&mut self, by_nanos: i64) {
+        self.schedule.rebase(by_nanos);
+        self.poller.iter_mut().for_each(|poller| poller.rebase(by_nanos));
     }
 }
 
@@ -160,6 +170,7 @@ impl Sending {
             poller: config.poll.as_ref().map(Poller::new),
             supply: config.supply,
             is_rescheduled: false,
+            is_quiet: false,
             polled: PollOutputs::default(),
         }
     }
@@ -171,6 +182,13 @@ impl Sending {
             test: self.test,
             poller: self.poller.as_ref().map(|poller| poller.progress().clone()),
             node: self.j1939.as_ref().map(|j1939| j1939.node.clone()),
+        }
+    }
+
+    /// Restores what remains of the diagnostic requests after a restart. `taken`: time of the stored state.
+    pub(crate) fn restore_silence(&mut self, state: &SendingState, taken: Timestamp, now: Timestamp) {
+        if let (Some(poller), Some(stored)) = (&mut self.poller, &state.poller) {
+            poller.restore_silence(stored, taken, now);
         }
     }
 
@@ -232,8 +250,14 @@ impl Sending {
         self.schedule.housekeeping = self.schedule.housekeeping.min(now);
     }
 
+    /// Omits cyclic frames while the buses sleep, unless they are configured.
+    pub(crate) fn set_asleep(&mut self, is_asleep: bool) {
+        self.is_quiet = is_asleep && self.config.as_ref().is_none_or(|config| !config.while_asleep);
+    }
+
     /// Makes all cyclic work due now. Called after a start, a sleep, and a gap.
     pub(crate) fn restart(&mut self, now: Timestamp) {
+        self.is_rescheduled = true;
         self.schedule.dues().into_iter().for_each(|due| *due = now);
         self.schedule.reply = self.schedule.reply.min(now);
         self.schedule.alarms.restart(now);
@@ -303,19 +327,21 @@ impl Sending {
     /// Whether the status, health and alarm frames and the digest are due; `None` without `[output]`.
     pub(crate) fn take_frames_due(&mut self, now: Timestamp) -> Option<[bool; 4]> {
         let (config, schedule) = (self.config.as_ref()?, &mut self.schedule);
-        Some([
+        let due = [
             take_due(&mut schedule.status, now, config.status_period_s),
             take_due(&mut schedule.health, now, config.health_period_s),
             take_due(&mut schedule.alarm, now, config.alarm_period_s),
             take_due(&mut schedule.digest, now, config.digest_period_s),
-        ])
+        ];
+        Some(due.map(|is_due| is_due && !self.is_quiet))
     }
 
     /// Whether the frame that announces the freshness for commands is due.
     pub(crate) fn take_freshness_due(&mut self, now: Timestamp) -> bool {
         let is_sent = |config: &OutputConfig| config.plan.authentication(LayoutMessage::Freshness).is_some();
         let due = &mut self.schedule.freshness;
-        self.config.as_ref().is_some_and(is_sent) && take_due(due, now, f64::from(FRESHNESS_PERIOD_MS) / 1000.0)
+        let period_s = f64::from(FRESHNESS_PERIOD_MS) / 1000.0;
+        self.config.as_ref().is_some_and(is_sent) && take_due(due, now, period_s) && !self.is_quiet
     }
 
     /// Announces the freshness that commands may use next. `bus`: interface on which commands are received.
@@ -355,6 +381,9 @@ impl Sending {
     /// Sends the due alarms within the budget.
     pub(crate) fn send_due_alarms(&mut self, now: Timestamp, engine: &AlarmEngine, out: &mut Outputs) {
         let Some(period_s) = self.config.as_ref().map(|config| config.alarm_period_s) else { return };
+        if self.is_quiet {
+            self.schedule.alarms.skip_turns(now, engine, period_s);
+        }
         // The loop ends when the budget is used up.
         while let Some(key) = self.schedule.alarms.take(now, engine, period_s) {
             self.send_key(now, key, engine, out);
@@ -563,6 +592,9 @@ impl Sending {
     /// Sends the due frames of the J1939 node.
     pub(crate) fn poll_j1939(&mut self, now: Timestamp, out: &mut Outputs) {
         if let Some(j1939) = &mut self.j1939 {
+            if self.is_quiet {
+                j1939.node.skip_cyclic(now);
+            }
             j1939.poll(now, out);
         }
     }
