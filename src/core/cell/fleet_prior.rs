@@ -108,7 +108,8 @@ impl FleetPrior {
                 unseen + (own.curve_v[a] - mean_v[a]) * (own.curve_v[b] - mean_v[b])
             });
         }
-        covariance /= count + LABEL_VEHICLES;
+        // Rounding must not make it asymmetric.
+        let covariance = (&covariance + covariance.transpose()) / (2.0 * (count + LABEL_VEHICLES));
         Some(CurvePrior { soc: SOC.to_vec(), mean_v, covariance, electrodes: label.electrodes })
     }
 
