@@ -26,12 +26,13 @@
 //! | | [`store`] | learned state in two files, history in SQLite |
 //! | | [`status`] | status document, metrics |
 //! | | [`service`] | the live loop: links, ticks, readiness, reload, watchdog |
+//! | | `http` | HTTP server of the exporter and of the uplink |
 //! | | [`exporter`] | metrics for Prometheus |
 //! | | [`replay`] | the loop over recorded logs |
 //! | | [`wiring_check`] | the two loops of `packwatch doctor`: over logs and over live input |
 //! | | `failure` | text and exit code of a failed command, for every program |
 //! | `src/lab` | `lab` | fit, score, remaining life, Gaussian processes, reports, passports, what-if, export, fleets, plots, import, discover (feature `lab`) |
-//! | `src/uplink` | `mqtt`, `kuksa`, `vss` | program `packwatch-uplink`, separate from the vehicle's program: sends the status to MQTT brokers and a KUKSA databroker |
+//! | `src/uplink` | `mqtt`, `kuksa`, `sovd`, `vss` | program `packwatch-uplink`, separate from the vehicle's program: sends the status to MQTT brokers, a KUKSA databroker and SOVD testers |
 //! | `src/python` | `python` | the Python module: the library as classes and functions; stubs and Python code are in its folder `packwatch` |
 //! | `src/cli` | [`cli`] | one file (and folder) per command with the command's name; `common` holds what commands share; `main.rs` only calls [`cli`] |
 //!

@@ -102,6 +102,7 @@ async fn serve(listener: TcpListener, site: Rc<Site>, socket: PathBuf) -> io::Re
         async move { answer(&request, &site, &activity, end).await }
     };
     http::serve(listener, &mut stop, answer).await;
+    notify(&[NotifyState::Stopping]);
     follower.abort();
     tracing::info!("exporter stopped");
     Ok(())

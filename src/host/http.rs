@@ -20,14 +20,12 @@ use hyper::server::conn::http1;
 use hyper::service::service_fn;
 pub use hyper::{Method, Request, Response, StatusCode, header};
 use hyper_util::rt::{TokioIo, TokioTimer};
-use sd_notify::NotifyState;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::task::JoinSet;
 use tokio::time::{sleep, timeout};
 
 use super::io::connection_slots::{Activity, ConnectionSlots, SlotLimits};
 use super::io::stop::Stop;
-use super::service::notify;
 
 /// Maximum number of connections. This is several times the need of two Prometheus servers and a browser.
 pub(crate) const MAX_CONNECTIONS: usize = 16;
@@ -81,7 +79,6 @@ where
             }
         }
     }
-    notify(&[NotifyState::Stopping]);
     drop(listener);
     // The current answers get a short time to finish. Then the remaining connections are closed, because an idle
     // connection would stay open.

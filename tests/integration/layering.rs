@@ -34,20 +34,25 @@ const TABLE: &[(&str, &[&str], Core)] = &[
     ("store", MODULES.split_at(16).0, Core::Shell),
     ("status", MODULES.split_at(16).0, Core::Shell),
     ("service", MODULES.split_at(18).0, Core::Shell),
-    ("exporter", MODULES.split_at(19).0, Core::Shell),
+    ("http", &["io"], Core::Shell),
+    ("exporter", MODULES.split_at(20).0, Core::Shell),
     ("replay", MODULES.split_at(19).0, Core::Shell),
     ("wiring_check", MODULES.split_at(19).0, Core::Shell),
     ("failure", &["config"], Core::Shell),
     ("lab", BELOW_LAB, Core::Shell),
     // A separate program: it reads the daemon's status and uses nothing of the daemon's loop.
-    ("uplink", &["quantity", "alarm", "monitor", "io", "logging", "control", "status", "failure"], Core::Shell),
+    (
+        "uplink",
+        &["quantity", "cell_faults", "alarm", "monitor", "io", "logging", "control", "status", "http", "failure"],
+        Core::Shell,
+    ),
     ("python", &MODULES, Core::Shell),
     ("cli", &MODULES, Core::Shell),
     ("main", &["cli"], Core::Shell),
 ];
 
 /// The modules of `src/core` and `src/host`, lowest first, then the lab's modules.
-const MODULES: [&str; 26] = [
+const MODULES: [&str; 27] = [
     "quantity",
     "filter",
     "can",
@@ -67,6 +72,7 @@ const MODULES: [&str; 26] = [
     "store",
     "status",
     "service",
+    "http",
     "exporter",
     "replay",
     "wiring_check",
@@ -76,7 +82,7 @@ const MODULES: [&str; 26] = [
     "lab",
 ];
 const CORE: &[&str] = MODULES.split_at(11).0;
-const BELOW_LAB: &[&str] = MODULES.split_at(25).0;
+const BELOW_LAB: &[&str] = MODULES.split_at(26).0;
 /// Crates under `src`. `Some`: the table has one row for the whole crate.
 const CRATES: [(&str, Option<&str>); 7] = [
     ("core", None),

@@ -38,6 +38,7 @@ def array(cells, key, factor=1.0):
 
 def standard(document):
     pack, cells, alarms = document["pack"], document["cells"], document["alarms"]
+    moved = pack["moved"] or {}
     volts, temperatures = array(cells, "voltage_v"), array(cells, "temperature_c")
     power = None if None in (pack["current_a"], pack["voltage_v"]) else single(-pack["current_a"] * pack["voltage_v"])
     raised = [alarm for alarm in alarms["list"] if alarm["state"] in ("active", "clearing", "suppressed", "latched")]
@@ -64,11 +65,11 @@ def standard(document):
         "StateOfHealth": None if (pack["soh"] or 0) > 1 else scaled(pack["soh"], 100.0),
         "ErrorCodes": codes,
         "TimeRemaining": None if pack["time_to_empty_s"] is None else round(pack["time_to_empty_s"]),
-        "AccumulatedChargedThroughput": single(pack["moved"]["charged_ah"]),
-        "AccumulatedConsumedThroughput": single(pack["moved"]["discharged_ah"]),
-        "AccumulatedChargedEnergy": scaled(pack["moved"]["charged_wh"], 1e-3),
-        "AccumulatedConsumedEnergy": scaled(pack["moved"]["discharged_wh"], 1e-3),
-        "TotalEnergyThroughput": round(pack["moved"]["charged_wh"] + pack["moved"]["discharged_wh"]),
+        "AccumulatedChargedThroughput": single(moved.get("charged_ah")),
+        "AccumulatedConsumedThroughput": single(moved.get("discharged_ah")),
+        "AccumulatedChargedEnergy": scaled(moved.get("charged_wh"), 1e-3),
+        "AccumulatedConsumedEnergy": scaled(moved.get("discharged_wh"), 1e-3),
+        "TotalEnergyThroughput": round(moved["charged_wh"] + moved["discharged_wh"]) if moved else None,
     }
 
 

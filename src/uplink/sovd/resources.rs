@@ -100,8 +100,10 @@ struct Item {
 enum Source {
     Pack(&'static QuantityRow),
     Cells(&'static QuantityRow),
-    Identity(fn(&StatusDocument) -> Value),
+    Identity(IdentityOf),
 }
+
+type IdentityOf = fn(&StatusDocument) -> Value;
 
 fn items() -> impl Iterator<Item = Item> {
     let item = |prefix: &str, row: &'static QuantityRow, it: &Presentation, source: Source| Item {
@@ -111,12 +113,12 @@ fn items() -> impl Iterator<Item = Item> {
     };
     let pack = PackValues::rows().map(move |(row, it)| item("", row, it, Source::Pack(row)));
     let cells = CellValues::rows().map(move |(row, it)| item("cells_", row, it, Source::Cells(row)));
-    let identity = |(id, name, value): (&str, &str, fn(&StatusDocument) -> Value)| Item {
+    let identity = |(id, name, value): (&str, &str, IdentityOf)| Item {
         id: id.to_owned(),
         name: name.to_owned(),
         source: Source::Identity(value),
     };
-    let identities: [(&str, &str, fn(&StatusDocument) -> Value); 4] = [
+    let identities: [(&str, &str, IdentityOf); 4] = [
         ("vehicle_id", "Identification number of the vehicle", |it| json!(it.vehicle.id)),
         ("vehicle_name", "Name of the vehicle", |it| json!(it.vehicle.name)),
         ("pack_name", "Name of the pack", |it| json!(it.vehicle.pack)),
