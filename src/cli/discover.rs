@@ -14,6 +14,7 @@ use super::common::numbers::integer;
 use super::common::output::{failure, print, print_json, table, unless_closed};
 use super::common::progress::Bar;
 use crate::config::{self, ConfigFaults};
+use crate::io::bounded_file;
 use crate::io::csv_log::CsvOptions;
 use crate::io::log::{LogCounts, LogOptions, LogSource};
 use crate::io::result_file::{ResultFile, check_place};
@@ -185,7 +186,7 @@ pub(crate) fn save<'a>(
     let read = |path: &Path| match &own {
         _ if path == file => Ok(pack.text.clone().into_bytes()),
         Some((own, text)) if path == own => Ok(text.as_bytes().to_vec()),
-        _ => std::fs::read(path),
+        _ => bounded_file::read(path),
     };
     let files = config::ConfigFiles { main: file.to_owned(), drop_ins: Vec::new() };
     config::load_with(&files, &read).map_err(|faults: ConfigFaults| {

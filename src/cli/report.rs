@@ -12,6 +12,7 @@ use super::common::replaying::{self, Replayed};
 use packwatch_host::failure::Failure;
 
 use crate::config::{self, Config, ConfigFiles, VehicleIdentity};
+use crate::io::bounded_file;
 use crate::io::result_file::check_place;
 use crate::lab;
 use crate::lab::report::{self, Data, Origin, PageContext, Verdict};
@@ -106,7 +107,7 @@ pub(crate) fn page_of_store(folder: &Path) -> Result<String, String> {
 /// Text of the configuration, merged with its drop-ins.
 fn config_text(path: &Path) -> Result<String, Failure> {
     match ConfigFiles::find(path)?.drop_ins.is_empty() {
-        true => fs::read_to_string(path).map_err(failure),
+        true => bounded_file::read_text(path).map_err(failure),
         false => Ok(config::merged(path)?),
     }
 }

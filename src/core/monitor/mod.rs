@@ -55,7 +55,7 @@ pub use stage::intake::command_gate::CommandCounts;
 pub use stage::learning::Throughput;
 pub use stage::learning::moved::MovedSums;
 pub use stage::modelling::{ModelChange, ModelView};
-pub use stage::sending::MAX_TEST_S;
+pub use stage::sending::{MAX_TEST_S, RESTART_FRESHNESS};
 pub use stage::statistics::{AlarmCounts, BusStatistics, LearningCounts, Statistics, VoltageCounts};
 
 /// The pure core of packwatch: takes records and returns outputs.
@@ -277,6 +277,12 @@ impl Monitor {
             | RecordKind::Reload
             | RecordKind::Restore { .. } => {}
         }
+    }
+
+    /// Freshness of the last authenticated frame. The driver must store the state before this number has risen by
+    /// [`RESTART_FRESHNESS`] since the last stored state.
+    pub fn sent_freshness(&self) -> u64 {
+        self.stages.sending.sent_freshness()
     }
 
     /// How to check the authenticator of a frame; `None` if the frame does not belong to an authenticated message. The

@@ -258,6 +258,15 @@ impl Engine {
         }
     }
 
+    /// If frames are authenticated, stores the state of the start. The caller sends no frame before.
+    pub(super) fn store_start(&mut self, time: Timestamp) {
+        if self.key.is_some()
+            && let Some(store) = &mut self.store
+        {
+            store.write_start(&self.monitor, time);
+        }
+    }
+
     /// Writes the last state to disk.
     pub(super) fn close_store(&mut self, time: Timestamp) {
         if let Some(store) = self.store.take() {

@@ -18,6 +18,7 @@ use crate::config::{
     Config, ConfigFaults, Databases, NamedSignal, PartialConfig, Pattern, RawTables, ReadFile, ResolvedSignal,
     SignalSource, TablePlace, answers, input_map, label_of,
 };
+use crate::io::bounded_file;
 use crate::quantity::{CellIndex, Channel, MAX_CELLS};
 use crate::wiring::{InterfacePlan, MessagePlan, OutputPlan, PackPlan, Plan, SignalPlan};
 
@@ -55,7 +56,7 @@ impl Survey {
 /// # Errors
 /// Fails if no interface is configured or no signal can be found, and returns all faults.
 pub fn survey(path: &Path) -> Result<Survey, ConfigFaults> {
-    survey_with(path, &|path: &Path| std::fs::read(path))
+    survey_with(path, &bounded_file::read)
 }
 
 /// Like [`survey`], but reads files with `read`.

@@ -34,9 +34,10 @@ pub const MAX_TEST_S: f64 = 600.0;
 const REPLY_BURST: i64 = 5;
 const REPLY_DELAY_NS: i64 = REPLY_DELAY_MS as i64 * 1_000_000;
 
-/// Number of freshness values skipped at a start. An earlier process may have sent frames after its state was stored.
-/// The skipped values suffice for more than an hour of such frames at the highest rate.
-const RESTART_FRESHNESS: u64 = 1 << 20;
+/// Number of freshness values skipped at a start. An earlier process may have sent this many frames after its state was
+/// stored: the driver stores the state before the first frame and after every half of these values. The value is so
+/// small that 300 starts a day do not overtake [`FRESHNESS_PER_S`].
+pub const RESTART_FRESHNESS: u64 = 1 << 16;
 /// At a start, the freshness is at least this value times the clock's time in seconds. The value exceeds the number of
 /// frames in a second.
 const FRESHNESS_PER_S: u64 = 256;
@@ -269,6 +270,11 @@ impl Sending {
         let by_clock = u64::try_from(now.nanos() / 1_000_000_000).unwrap_or(0).saturating_mul(FRESHNESS_PER_S);
         let sent = &mut self.schedule.sent_freshness;
         *sent = sent.saturating_add(RESTART_FRESHNESS).max(by_clock);
+    }
+
+    /// Freshness of the last authenticated frame.
+    pub(crate) fn sent_freshness(&self) -> u64 {
+        self.schedule.sent_freshness
     }
 
     /// Skips the counters of all frames that an earlier process sent after its state was stored, or would have sent by
