@@ -93,7 +93,7 @@ fn restart_at_night_finds_sleeping_bus() {
 
 #[test]
 fn sleeping_bus_carries_only_changes_unless_configured() {
-    let extra = "[[alarm]]\nrule = \"store_failed\"\nwarning = 10\n[[alarm]]\nrule = \"soc_low\"\ninfo = 0.99\n\
+    let extra = "[[alarm]]\nrule = \"store_failed\"\nwarning = 10\n[[alarm]]\nrule = \"soc_low\"\ninfo = 0.9\n\
                  [j1939]\naddress = 249\nidentity_number = 1\nmanufacturer_code = 2047\n";
     let mut rig = park(Rig::new(&format!("{ALARMS}{extra}")));
     fall_silent(&mut rig);
