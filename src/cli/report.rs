@@ -1,7 +1,6 @@
 //! `packwatch report`: writes an HTML page on the condition and history of a battery, from a store or a replay.
 
 use std::cell::RefCell;
-use std::fs;
 use std::path::{Path, PathBuf};
 use std::rc::Rc;
 
