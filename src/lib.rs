@@ -19,7 +19,8 @@
 //! | | [`sim`] | simulated truth, sensor errors, scenarios |
 //! | | [`wiring`] | evidence from signal values (`evidence`); checks wiring and configuration against recorded frames |
 //! | `src/regress` | `regress` | Gaussian process regression: pure numbers (feature `lab`) |
-//! | `src/host` | [`config`] | TOML to validated settings; reports all faults at once |
+//! | `src/host` | `bounded_file` | reads a file that describes something, up to a limit |
+//! | | [`config`] | TOML to validated settings; reports all faults at once |
 //! | | [`io`] | log files, CSV, CAN sockets, clock, journal, result and event files |
 //! | | [`logging`] | log lines |
 //! | | [`control`] | command socket |

@@ -11,8 +11,8 @@ use std::path::{Path, PathBuf};
 use super::common::output;
 use super::common::output::{print, print_json, unless_closed};
 use crate::config::{Description, KeySource, OutputUse, SignalUse};
-use crate::io::bounded_file;
 use crate::io::can_key::CanKey;
+use packwatch_host::bounded_file;
 use packwatch_host::failure::Failure;
 
 /// Arguments of `check`.

@@ -14,7 +14,6 @@ use super::common::numbers::integer;
 use super::common::output::{failure, print, print_json, table, unless_closed};
 use super::common::progress::Bar;
 use crate::config::{self, ConfigFaults};
-use crate::io::bounded_file;
 use crate::io::csv_log::CsvOptions;
 use crate::io::log::{LogCounts, LogOptions, LogSource};
 use crate::io::result_file::{ResultFile, check_place};
@@ -26,6 +25,7 @@ use crate::lab::import::obdb::ObdbSettings;
 use crate::monitor::RecordKind;
 use crate::replay::ReplayProgress;
 use crate::wiring::evidence::PackQuantity;
+use packwatch_host::bounded_file;
 use packwatch_host::failure::Failure;
 
 /// Arguments of `discover`.

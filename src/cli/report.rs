@@ -11,13 +11,13 @@ use super::common::replaying::{self, Replayed};
 use packwatch_host::failure::Failure;
 
 use crate::config::{self, Config, ConfigFiles, VehicleIdentity};
-use crate::io::bounded_file;
 use crate::io::result_file::check_place;
 use crate::lab;
 use crate::lab::report::{self, Data, Origin, PageContext, Verdict};
 use crate::monitor::Snapshot;
 use crate::replay::{OutputWatch, ReplaySummary, Sinks};
 use crate::store::HistoryReader;
+use packwatch_host::bounded_file;
 
 /// Arguments of `report`.
 #[derive(Debug, clap::Args)]

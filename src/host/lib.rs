@@ -3,6 +3,7 @@
 
 pub use packwatch_core::{alarm, can, cell, cell_faults, filter, health, monitor, quantity, sample, sim, wiring};
 
+pub mod bounded_file;
 pub mod config;
 pub mod control;
 pub mod exporter;

@@ -7,7 +7,7 @@
 use std::path::{Path, PathBuf};
 
 use crate::config::{self, Config, ConfigFaults, ConfigFiles};
-use crate::io::bounded_file;
+use packwatch_host::bounded_file;
 
 /// The built-in configuration and the files that it names.
 const BUILT_IN: [(&str, &[u8]); 2] =

@@ -353,5 +353,5 @@ fn vehicle_starts_from_what_a_fleet_has_learned() {
         (last.soc - 0.85, last.soc_std)
     });
     let [(_, label_std), (off, std)] = errors;
-    assert!(std < 0.7 * label_std && off.abs() < 1.96 * std, "{errors:?}");
+    assert!(std < 0.8 * label_std && off.abs() < 1.96 * std, "{errors:?}");
 }

@@ -2,8 +2,8 @@
 
 use std::path::Path;
 
+use packwatch_host::bounded_file;
 use packwatch_host::failure::Failure;
-use packwatch_host::io::bounded_file;
 
 use super::output::named;
 use crate::can::dbc::{Database, DbcError};

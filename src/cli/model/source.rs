@@ -8,9 +8,10 @@ use crate::cli::common::label::LabelArgs;
 use crate::cli::common::numbers::above_0;
 use crate::config::cell_model::{self, SourcedModel};
 use crate::config::{self, Config, of_label, of_view};
-use crate::io::{bounded_file, snapshot_file};
+use crate::io::snapshot_file;
 use crate::monitor::Snapshot;
 use crate::store::HistoryReader;
+use packwatch_host::bounded_file;
 use packwatch_host::failure::Failure;
 
 /// Selects a cell model.

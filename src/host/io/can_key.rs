@@ -14,9 +14,9 @@ use std::path::{Path, PathBuf};
 use aes::Aes128;
 use cmac::{Cmac, KeyInit, Mac as _};
 
+use crate::bounded_file;
 use crate::can::secoc::Mac;
 use crate::config::KeySource;
-use crate::io::bounded_file;
 
 /// Length of a key, bytes.
 const KEY_BYTES: usize = 16;

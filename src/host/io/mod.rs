@@ -1,7 +1,6 @@
 //! Reads and writes files and sockets: logs in every format, journals, result files and CAN interfaces.
 
 pub mod background_file;
-pub mod bounded_file;
 pub mod can_key;
 pub mod candump;
 pub mod clock;

@@ -3,7 +3,7 @@
 use std::io::{self, Write};
 use std::path::Path;
 
-use crate::io::bounded_file;
+use crate::bounded_file;
 use crate::io::json::json_fault;
 use crate::io::result_file::ResultFile;
 use crate::monitor::Snapshot;

@@ -31,6 +31,10 @@ const BATCH: usize = 256;
 /// time for it). The sockets then hold frames of a long time, which must be merged before they are handled. The time is
 /// the largest step back that the core accepts from frames merged out of order.
 const MAX_PAUSE_NS: i64 = MERGE_TOLERANCE_NS;
+/// Pause between two attempts to collect these frames, and maximum number of attempts. Nothing is collected after an attempt
+/// that found only frames received after the stop.
+const MERGE_ROUND: Duration = Duration::from_millis(10);
+const MERGE_ROUNDS: usize = 100;
 /// Maximum number of records that are merged after a stop. All sockets together hold fewer.
 const MAX_MERGED: usize = 1 << 20;
 /// Time for the interfaces to send queued frames when the daemon stops.
@@ -199,17 +203,18 @@ impl ServiceLoop {
         if self.clock.now().nanos() - self.ticked.nanos() <= MAX_PAUSE_NS {
             return;
         }
-        self.ticked = self.clock.now();
-        loop {
-            // The tasks of the interfaces read their sockets here.
-            tokio::task::yield_now().await;
+        let resumed = self.clock.now();
+        self.ticked = resumed;
+        for _ in 0..MERGE_ROUNDS {
+            // The tasks of the interfaces read their sockets here. Each of them has run before the pause ends.
+            tokio::time::sleep(MERGE_ROUND).await;
             let before = self.batch.len();
             while self.batch.len() < MAX_MERGED
                 && let Ok(received) = self.inbox.try_recv()
             {
                 self.batch.push(received);
             }
-            if self.batch.len() == before {
+            if self.batch[before..].iter().all(|record| record.time >= resumed) {
                 return;
             }
         }

@@ -9,6 +9,7 @@ mod beside;
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use crate::bounded_file;
 use crate::can::dbc::{Message, Signal};
 use crate::can::decode::{Binding, InputMap};
 use crate::can::encode::SentMessage;
@@ -18,7 +19,6 @@ use crate::config::{
     Config, ConfigFaults, Databases, NamedSignal, PartialConfig, Pattern, RawTables, ReadFile, ResolvedSignal,
     SignalSource, TablePlace, answers, input_map, label_of,
 };
-use crate::io::bounded_file;
 use crate::quantity::{CellIndex, Channel, MAX_CELLS};
 use crate::wiring::{InterfacePlan, MessagePlan, OutputPlan, PackPlan, Plan, SignalPlan};
 

@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 
 use super::Survey;
 use super::survey::survey_with;
-use crate::io::bounded_file;
+use crate::bounded_file;
 use crate::wiring::{Change, Severity, Topic, WiringFinding, WiringReport};
 
 /// Maximum number of trials, because every trial reads the logs again.

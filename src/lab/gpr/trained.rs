@@ -11,9 +11,9 @@ use serde::{Deserialize, Serialize};
 use super::{ColumnTable, interval, split, table, write_csv};
 
 use crate::error::LabError;
-use crate::io::bounded_file;
 use crate::io::json::json_fault;
 use crate::regress::{GprSettings, Model, Prediction, ProgressCallback, TrainingRows, fit};
+use packwatch_host::bounded_file;
 
 /// Format name in the first line.
 const FORMAT: &str = "packwatch gpr";

@@ -52,11 +52,11 @@ pub fn template(standard: Standard) -> Value {
 }
 
 /// Removes `null` values of a template that the manufacturer did not fill in, and the objects and lists that only
-/// contained such values. An empty list stays: it states that there is nothing.
+/// contained such values. An empty object or list stays, because the manufacturer wrote it.
 pub fn without_nulls(value: Value) -> Option<Value> {
     match value {
         Value::Null => None,
-        Value::Object(members) => {
+        Value::Object(members) if !members.is_empty() => {
             let known: Map<String, Value> =
                 members.into_iter().filter_map(|(name, value)| Some((name, without_nulls(value)?))).collect();
             (!known.is_empty()).then_some(Value::Object(known))

@@ -54,8 +54,6 @@ pub(crate) struct Sending {
     supply: Option<SupplyConfig>,
     /// Whether an alarm change has changed the time at which work is next due.
     is_rescheduled: bool,
-    /// Whether cyclic frames are omitted, because the buses sleep.
-    is_quiet: bool,
     /// Buffer for the poller's outputs; reused to avoid allocations.
     polled: PollOutputs,
 }
@@ -114,6 +112,12 @@ pub(crate) struct Schedule {
     freshness: Timestamp,
     /// Freshness of the last authenticated frame; all messages share one sequence.
     sent_freshness: u64,
+    /// Whether cyclic frames are omitted, because the buses sleep.
+    #[serde(default)]
+    is_quiet: bool,
+    /// Time before which a sleep omits no frames. After a restart, the program first has to hear the silence itself.
+    #[serde(default)]
+    quiet_from: Timestamp,
 }
 
 impl Schedule {
@@ -171,7 +175,6 @@ impl Sending {
             poller: config.poll.as_ref().map(Poller::new),
             supply: config.supply,
             is_rescheduled: false,
-            is_quiet: false,
             polled: PollOutputs::default(),
         }
     }
@@ -252,8 +255,14 @@ impl Sending {
     }
 
     /// Omits cyclic frames while the buses sleep, unless they are configured.
-    pub(crate) fn set_asleep(&mut self, is_asleep: bool) {
-        self.is_quiet = is_asleep && self.config.as_ref().is_none_or(|config| !config.while_asleep);
+    pub(crate) fn set_asleep(&mut self, now: Timestamp, is_asleep: bool) {
+        let is_asleep = is_asleep && now >= self.schedule.quiet_from;
+        self.schedule.is_quiet = is_asleep && self.config.as_ref().is_none_or(|config| !config.while_asleep);
+    }
+
+    /// After a restart: a sleep that the program has not seen yet omits no frames before `time`.
+    pub(crate) fn set_quiet_from(&mut self, time: Timestamp) {
+        self.schedule.quiet_from = time;
     }
 
     /// Makes all cyclic work due now. Called after a start, a sleep, and a gap.
@@ -339,7 +348,7 @@ impl Sending {
             take_due(&mut schedule.alarm, now, config.alarm_period_s),
             take_due(&mut schedule.digest, now, config.digest_period_s),
         ];
-        Some(due.map(|is_due| is_due && !self.is_quiet))
+        Some(due.map(|is_due| is_due && !self.schedule.is_quiet))
     }
 
     /// Whether the frame that announces the freshness for commands is due.
@@ -347,7 +356,7 @@ impl Sending {
         let is_sent = |config: &OutputConfig| config.plan.authentication(LayoutMessage::Freshness).is_some();
         let due = &mut self.schedule.freshness;
         let period_s = f64::from(FRESHNESS_PERIOD_MS) / 1000.0;
-        self.config.as_ref().is_some_and(is_sent) && take_due(due, now, period_s) && !self.is_quiet
+        self.config.as_ref().is_some_and(is_sent) && take_due(due, now, period_s) && !self.schedule.is_quiet
     }
 
     /// Announces the freshness that commands may use next. `bus`: interface on which commands are received.
@@ -387,7 +396,7 @@ impl Sending {
     /// Sends the due alarms within the budget.
     pub(crate) fn send_due_alarms(&mut self, now: Timestamp, engine: &AlarmEngine, out: &mut Outputs) {
         let Some(period_s) = self.config.as_ref().map(|config| config.alarm_period_s) else { return };
-        if self.is_quiet {
+        if self.schedule.is_quiet {
             self.schedule.alarms.skip_turns(now, engine, period_s);
         }
         // The loop ends when the budget is used up.
@@ -598,7 +607,7 @@ impl Sending {
     /// Sends the due frames of the J1939 node.
     pub(crate) fn poll_j1939(&mut self, now: Timestamp, out: &mut Outputs) {
         if let Some(j1939) = &mut self.j1939 {
-            if self.is_quiet {
+            if self.schedule.is_quiet {
                 j1939.node.skip_cyclic(now);
             }
             j1939.poll(now, out);

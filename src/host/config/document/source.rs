@@ -9,8 +9,8 @@ use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use super::faults::{ConfigFaults, Faults, SourceLine};
+use crate::bounded_file;
 use crate::config::schema::nearest;
-use crate::io::bounded_file;
 
 /// Largest number of drop-ins of one file. One per table is enough, and a file has about 40 tables.
 const MAX_DROP_INS: usize = 100;
