@@ -27,7 +27,7 @@ const TABLE: &[(&str, &[&str], Core)] = &[
     ("ident", &["quantity", "filter", "regress", "cell"], Core::Pure),
     ("formats", &["quantity", "can"], Core::Shell),
     ("bounded_file", &[], Core::Shell),
-    ("config", MODULES.split_at(12).0, Core::Shell),
+    ("config", BELOW_CONFIG, Core::Shell),
     ("token_bucket", &["quantity"], Core::Shell),
     ("io", MODULES.split_at(14).0, Core::Shell),
     ("logging", MODULES.split_at(15).0, Core::Shell),
@@ -83,7 +83,7 @@ const MODULES: [&str; 28] = [
     "ident",
     "lab",
 ];
-const CORE: &[&str] = MODULES.split_at(11).0;
+const BELOW_CONFIG: &[&str] = MODULES.split_at(12).0;
 const BELOW_LAB: &[&str] = MODULES.split_at(27).0;
 /// Crates under `src`. `Some`: the table has one row for the whole crate.
 const CRATES: [(&str, Option<&str>); 7] = [
