@@ -31,7 +31,8 @@ def replay_vehicle(line: str, command: list[str]) -> dict:
         manifest.write(line)
         manifest.flush()
         ran = subprocess.run([*command, manifest.name], capture_output=True, text=True, errors="replace", check=False)
-    if ran.returncode == 0:
+    # With status 1, the document states why the vehicle failed.
+    if ran.stdout.startswith("{"):
         (found,) = json.loads(ran.stdout)["vehicles"]
         row |= {"outcome": found["outcome"], "error": found["record"]["error"], "days": found["record"]["days"]}
     else:

@@ -19,19 +19,21 @@
 //! | | [`sim`] | simulated truth, sensor errors, scenarios |
 //! | | [`wiring`] | evidence from signal values (`evidence`); checks wiring and configuration against recorded frames |
 //! | `src/regress` | `regress` | Gaussian process regression: pure numbers (feature `lab`) |
-//! | `src/host` | [`config`] | TOML to validated settings; reports all faults at once |
+//! | `src/host` | `bounded_file` | reads a file that describes something, up to a limit |
+//! | | [`config`] | TOML to validated settings; reports all faults at once |
 //! | | [`io`] | log files, CSV, CAN sockets, clock, journal, result and event files |
 //! | | [`logging`] | log lines |
 //! | | [`control`] | command socket |
 //! | | [`store`] | learned state in two files, history in SQLite |
 //! | | [`status`] | status document, metrics |
 //! | | [`service`] | the live loop: links, ticks, readiness, reload, watchdog |
+//! | | `http` | HTTP server of the exporter and of the uplink |
 //! | | [`exporter`] | metrics for Prometheus |
 //! | | [`replay`] | the loop over recorded logs |
 //! | | [`wiring_check`] | the two loops of `packwatch doctor`: over logs and over live input |
 //! | | `failure` | text and exit code of a failed command, for every program |
 //! | `src/lab` | `lab` | fit, score, remaining life, Gaussian processes, reports, passports, what-if, export, fleets, plots, import, discover (feature `lab`) |
-//! | `src/uplink` | `mqtt`, `kuksa`, `vss` | program `packwatch-uplink`, separate from the vehicle's program: sends the status to MQTT brokers and a KUKSA databroker |
+//! | `src/uplink` | `mqtt`, `kuksa`, `sovd`, `vss` | program `packwatch-uplink`, separate from the vehicle's program: sends the status to MQTT brokers, a KUKSA databroker and SOVD testers |
 //! | `src/python` | `python` | the Python module: the library as classes and functions; stubs and Python code are in its folder `packwatch` |
 //! | `src/cli` | [`cli`] | one file (and folder) per command with the command's name; `common` holds what commands share; `main.rs` only calls [`cli`] |
 //!
@@ -79,7 +81,7 @@
 //! | a configuration key | `host/config/schema/keys/` (files `pack`, `input`, `limits`, `algorithms`, `traffic`), `host/config/mod.rs` (list of the steps) |
 //! | discovery and merging of drop-ins | `host/config/document/source.rs`, `host/config/document/merge.rs` |
 //! | identity of the vehicle | `host/config/result/vehicle.rs` |
-//! | a published number of pack or cell (status, metrics, MQTT, VSS) | `core/quantity/catalogue.rs` (row), `core/monitor/view.rs` (value) |
+//! | a published number of pack or cell (status, metrics, MQTT, VSS) | `core/quantity/catalogue/table.rs` (row), `core/monitor/view.rs` (value) |
 //! | another status field | `host/status/document.rs` (type), `host/status/collect.rs` (value), `cli/status` (screen) |
 //! | another metric | `host/status/metrics.rs` |
 //! | another MQTT entity | `uplink/mqtt/entity.rs` |

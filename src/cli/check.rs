@@ -4,14 +4,15 @@
 //! description on standard output; the exit code is 0. If the configuration is not valid, prints each fault on its own
 //! line of standard error; the exit code is 78.
 
-use std::fs::File;
 use std::io;
+use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 
 use super::common::output;
 use super::common::output::{print, print_json, unless_closed};
 use crate::config::{Description, KeySource, OutputUse, SignalUse};
 use crate::io::can_key::CanKey;
+use packwatch_host::bounded_file;
 use packwatch_host::failure::Failure;
 
 /// Arguments of `check`.
@@ -57,11 +58,13 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
 /// Checks the key file of `[authentication]`. Skips the check if this user has no permission to read the file.
 fn check_key(file: &Path) -> Result<(), Failure> {
     let Some(KeySource::File(path)) = crate::config::load(file)?.key else { return Ok(()) };
-    let is_file = path.metadata().is_ok_and(|found| found.is_file());
-    if is_file && File::open(&path).is_err_and(|error| error.kind() == io::ErrorKind::PermissionDenied) {
+    if bounded_file::open(&path).is_err_and(|error| error.kind() == io::ErrorKind::PermissionDenied) {
         return Ok(());
     }
-    CanKey::load(&KeySource::File(path), None).map(drop).map_err(Failure::config)
+    // Root may check the file of another user, who runs the daemon.
+    let user = nix::unistd::geteuid();
+    let owner = path.metadata().map_or(0, |found| found.uid());
+    CanKey::read(&path, Some(if user.is_root() { owner } else { user.as_raw() })).map(drop).map_err(Failure::config)
 }
 
 fn show(description: &Description, page: &mut String) {

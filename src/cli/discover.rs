@@ -25,6 +25,7 @@ use crate::lab::import::obdb::ObdbSettings;
 use crate::monitor::RecordKind;
 use crate::replay::ReplayProgress;
 use crate::wiring::evidence::PackQuantity;
+use packwatch_host::bounded_file;
 use packwatch_host::failure::Failure;
 
 /// Arguments of `discover`.
@@ -185,7 +186,7 @@ pub(crate) fn save<'a>(
     let read = |path: &Path| match &own {
         _ if path == file => Ok(pack.text.clone().into_bytes()),
         Some((own, text)) if path == own => Ok(text.as_bytes().to_vec()),
-        _ => std::fs::read(path),
+        _ => bounded_file::read(path),
     };
     let files = config::ConfigFiles { main: file.to_owned(), drop_ins: Vec::new() };
     config::load_with(&files, &read).map_err(|faults: ConfigFaults| {

@@ -6,17 +6,20 @@ use std::path::{Path, PathBuf};
 use indicatif::HumanBytes;
 use serde_json::json;
 
+use super::common::label::one_of_chemistries;
 use super::common::logs::InputArgs;
 use super::common::many_logs;
-use super::common::numbers::{integer, within};
+use super::common::numbers::{above_0, integer, within};
 use super::common::output::{check_distinct, failure, print, print_json, unless_closed};
 use super::common::progress::progress_bar;
+use crate::cell::{FleetPrior, Label, OwnModel};
 use crate::config::{self, Config};
 use crate::io::result_file::ResultFile;
 use crate::lab::error::LabError;
 use crate::lab::fleet::LogAccess;
 use crate::lab::fleet::export::merge::{MergeSummary, merge};
 use crate::lab::fleet::export::{ExportSettings, TableFormat};
+use crate::lab::fleet::prior::combine;
 use crate::lab::fleet::vehicle::{Vehicle, VehicleRecord};
 use crate::lab::fleet::vehicles::{self, Outcome, Shard};
 use packwatch_host::failure::Failure;
@@ -39,6 +42,8 @@ enum FleetCommand {
     Run(RunArgs),
     /// Merge the tables of all shards
     Merge(MergeArgs),
+    /// Combine what the vehicles have learned about their cells into a prior for the next vehicle
+    Prior(PriorArgs),
 }
 
 #[derive(Debug, clap::Args)]
@@ -59,7 +64,7 @@ struct PlanArgs {
 #[command(
     after_help = "Writes DIR/VEHICLE/half_cycles.parquet, alarms.parquet, with --estimates estimates.parquet, and last vehicle.json. Vehicles that have \
     vehicle.json are not replayed again, so a stopped run can be continued. If a vehicle fails, the run reports it and continues; the next run tries \
-    it again. The exit code is 0 if every vehicle was replayed or its failure was recorded."
+    it again. The exit code is 0 if every vehicle was replayed, 1 if a vehicle failed."
 )]
 struct RunArgs {
     /// Manifest to read
@@ -107,12 +112,34 @@ struct MergeArgs {
     json: bool,
 }
 
+#[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Vehicles take part if their configuration describes the cells by a label (pack.chemistry and pack.rated_capacity_ah) and if their \
+    logs sufficed to learn a model. A further vehicle with the same label starts from the prior with pack.prior = \"FILE\". The same fleet gives the \
+    same bytes."
+)]
+struct PriorArgs {
+    /// Folder written by `fleet merge`
+    #[arg(value_name = "DIR")]
+    tables: PathBuf,
+    /// Prior to write; - writes standard output
+    #[arg(short, long, value_name = "FILE", default_value = "-")]
+    out: PathBuf,
+    /// Use only vehicles with this chemistry
+    #[arg(long, value_parser = one_of_chemistries())]
+    chemistry: Option<String>,
+    /// Use only vehicles with this rated capacity of a cell (Ah)
+    #[arg(long, value_name = "AH", value_parser = above_0)]
+    rated: Option<f64>,
+}
+
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     match &args.command {
         FleetCommand::Plan(args) => plan(args),
         FleetCommand::Run(args) => replay(args),
         FleetCommand::Merge(args) => merge_runs(args),
+        FleetCommand::Prior(args) => write_prior(args),
     }
 }
 
@@ -123,12 +150,7 @@ fn plan(args: &PlanArgs) -> Result<(), Failure> {
     if args.out == Path::new("-") {
         return print(&text);
     }
-    let write = || {
-        let mut file = ResultFile::create(&args.out)?;
-        file.write_all(text.as_bytes())?;
-        file.finish()
-    };
-    write().map_err(failure)?;
+    write_result(&args.out, text.as_bytes())?;
     let bytes: u64 = vehicles.iter().map(|vehicle| vehicle.bytes).sum();
     print(&format!("{}: {} vehicles, {}\n", args.out.display(), vehicles.len(), HumanBytes(bytes)))
 }
@@ -161,7 +183,11 @@ fn replay(args: &RunArgs) -> Result<(), Failure> {
     let outcomes = vehicles::run(&chosen, &config_of, &settings, &|bytes| bar.inc(bytes));
     bar.finish_and_clear();
     let outcomes = outcomes.map_err(failure)?;
-    unless_closed(if args.json { print_json(&document(&outcomes)) } else { summary(&outcomes, args.shard) })
+    unless_closed(if args.json { print_json(&document(&outcomes)) } else { summary(&outcomes, args.shard) })?;
+    match outcomes.iter().filter(|outcome| matches!(outcome, Outcome::Failed(_))).count() {
+        0 => Ok(()),
+        failed => Err(Failure::new(format!("{failed} of {} vehicles failed", outcomes.len()))),
+    }
 }
 
 fn document(outcomes: &[Outcome]) -> serde_json::Value {
@@ -215,6 +241,36 @@ fn merge_runs(args: &MergeArgs) -> Result<(), Failure> {
     let rows: Vec<String> = rows.iter().map(|(table, rows)| format!("{table} {rows} rows")).collect();
     text += &format!("{vehicles} vehicles, {} failed; {}\n", failed.len(), rows.join(", "));
     print(&text)
+}
+
+fn write_prior(args: &PriorArgs) -> Result<(), Failure> {
+    let is_wanted = |label: &Label| {
+        args.chemistry.as_ref().is_none_or(|name| name == label.chemistry.name())
+            && args.rated.is_none_or(|rated_ah| rated_ah == label.rated_ah)
+    };
+    let prior = combine(&args.tables, is_wanted).map_err(failure)?;
+    let text =
+        toml::to_string(&prior).map_err(|error| Failure::new(format!("the prior cannot be written: {error}")))?;
+    if args.out == Path::new("-") {
+        return print(&text);
+    }
+    write_result(&args.out, text.as_bytes())?;
+    let FleetPrior { label, vehicles, mean: OwnModel { capacity, .. }, .. } = &prior;
+    print(&format!(
+        "{}: {vehicles} vehicles, {label}; capacity {:.3} ± {:.3} Ah\n",
+        args.out.display(),
+        capacity.mean,
+        capacity.std()
+    ))
+}
+
+fn write_result(path: &Path, bytes: &[u8]) -> Result<(), Failure> {
+    let write = || {
+        let mut file = ResultFile::create(path)?;
+        file.write_all(bytes)?;
+        file.finish()
+    };
+    write().map_err(failure)
 }
 
 fn period(text: &str) -> Result<f64, String> {

@@ -83,6 +83,9 @@ enum Command {
     /// Send the status of the running daemon to a KUKSA databroker (needs packwatch-uplink)
     #[command(disable_help_flag = true)]
     Kuksa(uplink::Args),
+    /// Serve status and faults of the running daemon to SOVD testers (needs packwatch-uplink)
+    #[command(disable_help_flag = true)]
+    Sovd(uplink::Args),
     /// Write the VSS overlay for KUKSA (needs packwatch-uplink)
     #[command(disable_help_flag = true)]
     Vss(uplink::Args),
@@ -175,6 +178,7 @@ pub fn main() -> ExitCode {
         Command::Exporter(args) => exporter::run(&args),
         Command::Mqtt(args) => uplink::run("mqtt", &args),
         Command::Kuksa(args) => uplink::run("kuksa", &args),
+        Command::Sovd(args) => uplink::run("sovd", &args),
         Command::Vss(args) => uplink::run("vss", &args),
         Command::Alarms(args) => alarms::run(&args),
         Command::Acknowledge(args) => command::acknowledge(&args),

@@ -44,15 +44,16 @@ const STANDARDS: [NamedValue<Standard>; 2] = [
     each missing value with the reason and a remedy. The static part may state everything that packwatch does not \
     measure; a value that both parts have is an error.",
     override_usage = "packwatch passport [OPTIONS] --config <FILE> <LOG>...\n       \
-    packwatch passport [OPTIONS] --config <FILE> --state <DIR>"
+    packwatch passport [OPTIONS] --config <FILE> --state <DIR>\n       \
+    packwatch passport [--form <STANDARD>] --static-template"
 )]
 pub(crate) struct Args {
     /// Configuration file of the pack
-    #[arg(short, long, value_name = "FILE")]
-    config: PathBuf,
+    #[arg(short, long, value_name = "FILE", required_unless_present = "static_template")]
+    config: Option<PathBuf>,
     /// Journals, candump logs or CSV files of the battery's whole life, also .gz or .zst; read in this order as one
     /// record
-    #[arg(value_name = "LOG", required_unless_present = "state", conflicts_with = "state")]
+    #[arg(value_name = "LOG", required_unless_present_any = ["state", "static_template"], conflicts_with = "state")]
     logs: Vec<PathBuf>,
     /// Folder of state and history to use instead of logs; a running daemon may use it
     #[arg(long, value_name = "DIR")]
@@ -64,6 +65,10 @@ pub(crate) struct Args {
     /// accidents
     #[arg(long = "static", value_name = "FILE.json")]
     manufacturer: Option<PathBuf>,
+    /// Write an empty manufacturer's part in the form of the standard: fill in what is known, leave null where nothing is,
+    /// and give the file back with --static
+    #[arg(long, conflicts_with_all = ["config", "logs", "state", "manufacturer", "details"])]
+    static_template: bool,
     /// Usable energy of the pack at certification (kWh); needed for the state of certified energy (SOCE)
     #[arg(long, value_name = "KWH", value_parser = above_0)]
     certified_energy_kwh: Option<f64>,
@@ -90,8 +95,10 @@ fn at_least_0(text: &str) -> Result<f64, String> {
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     args.check()?;
-    let config = config::load(&args.config)?;
+    let Some(config) = &args.config else { return write(&args.out, &passport::template(args.form)) };
+    let config = config::load(config)?;
     let manufacturer = args.manufacturer.as_deref().map(read_static).transpose()?;
+    let manufacturer = manufacturer.and_then(passport::without_nulls);
     let manufacturer = manufacturer.unwrap_or_else(|| Value::Object(Map::new()));
     let (record, vehicle) = match &args.state {
         Some(folder) => load_store(folder, &config)?,
@@ -114,7 +121,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
 
 impl Args {
     fn check(&self) -> Result<(), Failure> {
-        let inputs = || self.logs.iter().chain(&self.manufacturer).chain([&self.config]);
+        let inputs = || self.logs.iter().chain(&self.manufacturer).chain(&self.config);
         for out in self.details.iter().chain([&self.out]) {
             check_place(out, inputs()).map_err(Failure::new)?;
         }

@@ -1,7 +1,6 @@
 //! `packwatch report`: writes an HTML page on the condition and history of a battery, from a store or a replay.
 
 use std::cell::RefCell;
-use std::fs;
 use std::path::{Path, PathBuf};
 use std::rc::Rc;
 
@@ -18,6 +17,7 @@ use crate::lab::report::{self, Data, Origin, PageContext, Verdict};
 use crate::monitor::Snapshot;
 use crate::replay::{OutputWatch, ReplaySummary, Sinks};
 use crate::store::HistoryReader;
+use packwatch_host::bounded_file;
 
 /// Arguments of `report`.
 #[derive(Debug, clap::Args)]
@@ -106,7 +106,7 @@ pub(crate) fn page_of_store(folder: &Path) -> Result<String, String> {
 /// Text of the configuration, merged with its drop-ins.
 fn config_text(path: &Path) -> Result<String, Failure> {
     match ConfigFiles::find(path)?.drop_ins.is_empty() {
-        true => fs::read_to_string(path).map_err(failure),
+        true => bounded_file::read_text(path).map_err(failure),
         false => Ok(config::merged(path)?),
     }
 }

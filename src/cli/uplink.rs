@@ -1,4 +1,4 @@
-//! `packwatch mqtt`, `kuksa` and `vss`: replace this process by the program `packwatch-uplink`, which is in a separate
+//! `packwatch mqtt`, `kuksa`, `sovd` and `vss`: replace this process by the program `packwatch-uplink`, which is in a separate
 //! package.
 //!
 //! `packwatch-uplink` is searched for first in the folder of this program, then in `PATH`.

@@ -10,6 +10,8 @@
 pub mod bounds;
 pub mod catalogue;
 
+use std::fmt;
+
 use serde::{Deserialize, Serialize};
 
 /// Length of a day (s).
@@ -81,6 +83,13 @@ pub struct InvalidState {
     pub found: f64,
     /// Allowed range, with unit.
     pub allowed: &'static str,
+}
+
+impl fmt::Display for InvalidState {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { what, found, allowed } = self;
+        write!(f, "{what} is {found}, must be {allowed}")
+    }
 }
 
 impl InvalidState {

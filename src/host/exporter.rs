@@ -7,68 +7,35 @@
 //! * `/`: the live page; `/events`: its server-sent events; `/-/healthy`: a liveness check.
 //! * `/report`: the report of the daemon's store, if this program can make reports.
 //! * On the address of a network, the page and the events need a token ([`Access`]).
-//! * At most [`MAX_CONNECTIONS`] connections are open, and [`MAX_PER_ADDRESS`] per client address. A further connection
-//!   replaces the one that has been idle longest. If none has been idle for long enough, the further connection is
-//!   closed ([`ConnectionSlots`]).
-//! * The head of a request may have up to [`MAX_REQUEST_BYTES`] bytes and must arrive within [`HEAD_LIMIT`]. Bodies are
-//!   not read.
+//! * The connections are those of [`http`].
 //! * SIGTERM and SIGINT stop the exporter cleanly.
 
 mod access;
 mod live;
 mod page;
 
-use std::convert::Infallible;
 use std::io;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
-use std::pin::pin;
 use std::rc::Rc;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
-use http_body_util::Full;
-use hyper::body::{Bytes, Incoming};
 use hyper::header::{
-    ACCEPT, ALLOW, CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, HeaderMap, HeaderName, HeaderValue, LOCATION,
-    REFERRER_POLICY, SET_COOKIE, WWW_AUTHENTICATE, X_CONTENT_TYPE_OPTIONS,
+    ACCEPT, ALLOW, CONTENT_SECURITY_POLICY, HeaderMap, LOCATION, REFERRER_POLICY, SET_COOKIE, WWW_AUTHENTICATE,
 };
-use hyper::server::conn::http1;
-use hyper::service::service_fn;
-use hyper::{Method, Request, Response, StatusCode};
-use hyper_util::rt::{TokioIo, TokioTimer};
 use sd_notify::NotifyState;
-use tokio::net::{TcpListener, TcpStream};
+use tokio::net::TcpListener;
 use tokio::sync::Semaphore;
-use tokio::task::{JoinSet, LocalSet, spawn_blocking};
-use tokio::time::{sleep, timeout};
+use tokio::task::{LocalSet, spawn_blocking};
 
 use self::access::{Access, Decision};
 use self::live::{AnswerBody, Live};
-use super::io::connection_slots::{Activity, ConnectionSlots, SlotLimits};
+use super::http::{self, Bytes, Full, Incoming, Request, Response, StatusCode, answer_with, reads, with};
+use super::io::connection_slots::Activity;
 use super::io::stop::Stop;
 use super::service::notify;
 use super::status::metrics::{openmetrics, prometheus_text};
-
-/// Maximum number of connections. This is several times the need of two Prometheus servers and a browser.
-const MAX_CONNECTIONS: usize = 16;
-/// Maximum number of connections of one address.
-const MAX_PER_ADDRESS: usize = 8;
-/// Longest head of a request, bytes. This is the smallest limit that hyper supports.
-const MAX_REQUEST_BYTES: usize = 8192;
-/// Maximum number of headers of a request.
-const MAX_HEADERS: usize = 64;
-/// Longest wait for the head of a request. A connection that is silent for longer is closed.
-const HEAD_LIMIT: Duration = Duration::from_secs(30);
-/// Longest life of a connection, so that a slow reader does not keep its slot for ever.
-const CONNECTION_LIMIT: Duration = Duration::from_secs(300);
-/// Time to finish the current answer when a connection reaches [`CONNECTION_LIMIT`]. By default, Prometheus waits this
-/// long for a scrape.
-const ANSWER_LIMIT: Duration = Duration::from_secs(10);
-/// Time to finish the current answers when the exporter stops.
-const DRAIN_LIMIT: Duration = Duration::from_secs(1);
-/// Pause after a connection could not be accepted.
-const ACCEPT_PAUSE: Duration = Duration::from_secs(1);
 
 const OPENMETRICS: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
 const PROMETHEUS_TEXT: &str = "text/plain; version=0.0.4; charset=utf-8";
@@ -128,74 +95,23 @@ async fn serve(listener: TcpListener, site: Rc<Site>, socket: PathBuf) -> io::Re
     }
     let status = format!("listening on {address}");
     notify(&[NotifyState::Ready, NotifyState::Status(&status)]);
-    let mut places = ConnectionSlots::new(SlotLimits { total: MAX_CONNECTIONS, per_client: MAX_PER_ADDRESS });
-    let mut connections = JoinSet::new();
     let live = Rc::clone(&site.live);
     let follower = tokio::task::spawn_local(async move { live.follow(&socket).await });
-    loop {
-        let accepted = tokio::select! {
-            () = stop.wait() => break,
-            Some(_) = connections.join_next() => continue,
-            accepted = listener.accept() => accepted,
-        };
-        match accepted {
-            Ok((_, client)) if !places.make_room(&client.ip(), Instant::now()) => {
-                tracing::debug!(%client, "connection closed: too many at once");
-            }
-            Ok((stream, client)) => {
-                let activity = Activity::new();
-                let task = connections.spawn_local(serve_connection(stream, Rc::clone(&site), activity.clone()));
-                places.take(client.ip(), activity, task);
-            }
-            Err(error) => {
-                tracing::warn!(%error, "connection not accepted");
-                sleep(ACCEPT_PAUSE).await;
-            }
-        }
-    }
+    let answer = move |request: Request<Incoming>, activity: Activity, end| {
+        let site = Rc::clone(&site);
+        async move { answer(&request, &site, &activity, end).await }
+    };
+    http::serve(listener, &mut stop, answer).await;
     notify(&[NotifyState::Stopping]);
-    drop(listener);
     follower.abort();
-    // The current answers get a short time to finish. Then the remaining connections are closed, because an idle
-    // connection would stay open.
-    let drained = async { while connections.join_next().await.is_some() {} };
-    let _ = timeout(DRAIN_LIMIT, drained).await;
     tracing::info!("exporter stopped");
     Ok(())
-}
-
-async fn serve_connection(stream: TcpStream, site: Rc<Site>, activity: Activity) {
-    let end = Instant::now() + CONNECTION_LIMIT;
-    let answer = service_fn(move |request| {
-        let (site, activity) = (Rc::clone(&site), activity.clone());
-        async move {
-            activity.begin_request();
-            let answer = answer(&request, &site, &activity, end).await;
-            activity.end_request();
-            Ok::<_, Infallible>(answer)
-        }
-    });
-    let mut builder = http1::Builder::new();
-    builder.timer(TokioTimer::new()).header_read_timeout(HEAD_LIMIT);
-    builder.max_buf_size(MAX_REQUEST_BYTES).max_headers(MAX_HEADERS);
-    let mut connection = pin!(builder.serve_connection(TokioIo::new(stream), answer));
-    let ended = match timeout(CONNECTION_LIMIT, connection.as_mut()).await {
-        Ok(ended) => ended,
-        Err(_) => {
-            // The connection finishes its current answer and accepts no further request.
-            connection.as_mut().graceful_shutdown();
-            timeout(ANSWER_LIMIT, connection).await.unwrap_or(Ok(()))
-        }
-    };
-    if let Err(error) = ended {
-        tracing::debug!(%error, "connection ended");
-    }
 }
 
 type Answer = Response<AnswerBody>;
 
 async fn answer(request: &Request<Incoming>, site: &Site, activity: &Activity, end: Instant) -> Answer {
-    if !matches!(*request.method(), Method::GET | Method::HEAD) {
+    if !reads(request) {
         let refused = respond(StatusCode::METHOD_NOT_ALLOWED, PLAIN, "must be GET or HEAD\n");
         return with(refused, ALLOW, "GET, HEAD");
     }
@@ -204,7 +120,9 @@ async fn answer(request: &Request<Incoming>, site: &Site, activity: &Activity, e
         Decision::Allowed => {}
         Decision::SetCookie(cookie) => {
             let moved = respond(StatusCode::SEE_OTHER, PLAIN, "the token is accepted\n");
-            return with(with(moved, LOCATION, path), SET_COOKIE, &cookie);
+            // Two slashes would begin the name of another host.
+            let own = format!("/{}", path.trim_start_matches('/'));
+            return with(with(moved, LOCATION, &own), SET_COOKIE, &cookie);
         }
         Decision::NeedsToken => {
             let refused = respond(StatusCode::UNAUTHORIZED, PLAIN, NEEDS_TOKEN);
@@ -230,26 +148,11 @@ fn respond(status: StatusCode, kind: &'static str, text: impl Into<Bytes>) -> An
     answer_with(status, kind, AnswerBody::Whole(Full::new(text.into())))
 }
 
-fn answer_with(status: StatusCode, kind: &'static str, body: AnswerBody) -> Answer {
-    let mut response = Response::new(body);
-    *response.status_mut() = status;
-    let response = with(response, CONTENT_TYPE, kind);
-    with(with(response, CACHE_CONTROL, "no-store"), X_CONTENT_TYPE_OPTIONS, "nosniff")
-}
-
-/// Adds a header; leaves it out if the value is not valid.
-fn with(mut answer: Answer, name: HeaderName, value: &str) -> Answer {
-    if let Ok(value) = HeaderValue::from_str(value) {
-        answer.headers_mut().insert(name, value);
-    }
-    answer
-}
-
 /// Makes the report of the daemon's store.
 async fn report(site: &Site) -> Answer {
     let Some(make) = site.report else { return respond(StatusCode::NOT_FOUND, PLAIN, NO_REPORT) };
     let store = site.live.document().await.and_then(|document| document.store);
-    let folder = store.map(|store| PathBuf::from(store.path));
+    let folder = store.filter(|store| !store.path.is_empty()).map(|store| PathBuf::from(store.path));
     let Some(folder) = folder else { return respond(StatusCode::NOT_FOUND, PLAIN, "no daemon with a store answers\n") };
     let Ok(permit) = Arc::clone(&site.report_permit).acquire_owned().await else {
         return respond(StatusCode::SERVICE_UNAVAILABLE, PLAIN, "the exporter stops\n");

@@ -3,10 +3,12 @@
 
 pub use packwatch_core::{alarm, can, cell, cell_faults, filter, health, monitor, quantity, sample, sim, wiring};
 
+pub mod bounded_file;
 pub mod config;
 pub mod control;
 pub mod exporter;
 pub mod failure;
+pub mod http;
 pub mod io;
 pub mod logging;
 pub mod replay;

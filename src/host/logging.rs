@@ -33,6 +33,9 @@ static LEFT_OUT: AtomicU64 = AtomicU64::new(0);
 /// Crates of this program that log in addition to `packwatch` itself.
 const MEMBER_CRATES: [&str; 4] = ["packwatch_core", "packwatch_host", "packwatch_lab", "packwatch_uplink"];
 
+/// The MQTT library. It warns about every rejected message; the uplink logs each reason once.
+const MQTT_LIBRARY: &str = "rumqttc";
+
 /// Counts a line that was not logged.
 fn note_left_out() {
     LEFT_OUT.fetch_add(1, Ordering::Relaxed);
@@ -88,7 +91,9 @@ fn targets(text: &str) -> Result<Targets, String> {
     let members =
         modules.flat_map(|(module, level)| MEMBER_CRATES.map(|member| (format!("{member}::{module}"), level)));
     let members: Vec<_> = members.collect();
-    Ok(filter.with_targets(members))
+    let is_quiet = !text.contains(MQTT_LIBRARY) && filter.default_level() <= Some(LevelFilter::INFO);
+    let library = is_quiet.then_some((MQTT_LIBRARY.to_owned(), LevelFilter::ERROR));
+    Ok(filter.with_targets(members).with_targets(library))
 }
 
 /// Whether standard error is connected to journald. systemd identifies this stream by device and inode.
@@ -118,6 +123,9 @@ mod tests {
         assert!(
             all.would_enable("packwatch_host::service", &Level::DEBUG) && !all.would_enable("hyper", &Level::ERROR)
         );
+        for (filter, is_logged) in [("info", false), ("debug", true), ("info,rumqttc=warn", true)] {
+            assert_eq!(targets(filter).unwrap().would_enable("rumqttc::state", &Level::WARN), is_logged, "{filter}");
+        }
         assert!(targets("loud").unwrap_err().contains("\"loud\" is not a level, must be error, warn"));
         assert!(targets("packwatch::io=loud").unwrap_err().starts_with("log filter 'packwatch::io=loud': "));
     }

@@ -144,6 +144,7 @@ impl Service {
         // The first input is a tick at the time of the start. The frames that this tick causes wait in the send queues
         // until the tasks of the interfaces run.
         engine.handle(&Record::tick(clock.now()));
+        engine.store_start(clock.now());
         engine.report_store_health(clock.now());
         let status_publisher = StatusPublisher::new(status, self.identity(clock));
         let mut service = ServiceLoop {
@@ -155,6 +156,7 @@ impl Service {
             clock,
             clock_steps: StepDetector::new(start),
             batch: Vec::new(),
+            ticked: clock.now(),
             left_out_reported: Instant::now(),
             status_publisher,
             model_fit: None,

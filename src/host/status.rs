@@ -23,6 +23,7 @@ pub mod client;
 pub mod collect;
 pub mod counters;
 pub mod document;
+pub mod event_words;
 pub mod metrics;
 #[cfg(test)]
 #[path = "status/tests/quantities.rs"]

@@ -39,6 +39,7 @@ mod writer;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
 
 use tokio::sync::watch;
 
@@ -46,7 +47,7 @@ use crate::alarm::AlarmChange;
 use crate::config::{StoreConfig, VehicleIdentity};
 use crate::io::background_file::{MAX_FINISH, ends_in_time};
 use crate::io::place::{PlaceSetting, first_folder};
-use crate::monitor::{Downtime, Event, LearnedCell, Monitor, Snapshot};
+use crate::monitor::{Downtime, Event, LearnedCell, Monitor, RESTART_FRESHNESS, Snapshot};
 use crate::quantity::Timestamp;
 use checkpoint::CheckpointSchedule;
 use database::Database;
@@ -134,6 +135,8 @@ pub struct Store {
     folder: PathBuf,
     schedule: CheckpointSchedule,
     runtime_written: Option<Timestamp>,
+    /// [`Monitor::sent_freshness`] of the last queued state.
+    stored_freshness: u64,
 }
 
 impl Store {
@@ -200,6 +203,7 @@ impl Store {
             state_files,
             knows_state: database.is_some() || !found.states.is_empty(),
             needs_state: true,
+            was_replaced: false,
             database,
             progress: sender,
             retry,
@@ -215,6 +219,7 @@ impl Store {
             folder: path,
             schedule: CheckpointSchedule::new(config.checkpoint_s),
             runtime_written: None,
+            stored_freshness: 0,
         };
         Ok((Some(store), found))
     }
@@ -254,12 +259,35 @@ impl Store {
             runtime.put(self.document(monitor, now));
             self.runtime_written = Some(now);
         }
-        if !self.schedule.is_due(now, if is_fresh { 0.0 } else { QUIET_PERIOD_S }) {
+        let has_used_freshness =
+            monitor.sent_freshness().saturating_sub(self.stored_freshness) >= RESTART_FRESHNESS / 2;
+        if !has_used_freshness && !self.schedule.is_due(now, if is_fresh { 0.0 } else { QUIET_PERIOD_S }) {
             return false;
         }
-        let commit = self.history_filter.checkpoint(now);
-        self.submit(commit, monitor, now);
+        self.write_checkpoint(monitor, now);
         true
+    }
+
+    /// Queues a checkpoint. Returns its ticket.
+    fn write_checkpoint(&mut self, monitor: &Monitor, now: Timestamp) -> u64 {
+        let commit = self.history_filter.checkpoint(now);
+        self.submit(commit, monitor, now)
+    }
+
+    /// Writes the state of a start and waits until it is on disk, for a limited time. A power cut right after the start
+    /// then cannot make the next start use the same freshness again.
+    pub fn write_start(&mut self, monitor: &Monitor, now: Timestamp) {
+        let ticket = self.write_checkpoint(monitor, now);
+        let limit = Instant::now() + MAX_FINISH;
+        while self.progress.borrow().ticket < ticket && Instant::now() < limit {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        let progress = *self.progress.borrow();
+        if progress.ticket < ticket || !progress.works {
+            tracing::error!(
+                "state not stored before the first authenticated frame: a power cut may repeat its freshness"
+            );
+        }
     }
 
     /// Writes the last state, and waits a limited time until it is on disk.
@@ -285,6 +313,9 @@ impl Store {
     /// Queues rows and the state for the writer. Returns the ticket.
     fn submit(&mut self, HistoryCommit { rows, with_state }: HistoryCommit, monitor: &Monitor, now: Timestamp) -> u64 {
         let state = self.document(monitor, now);
+        if with_state {
+            self.stored_freshness = monitor.sent_freshness();
+        }
         self.schedule.note_written(now, rows.len(), with_state.then_some(self.progress.borrow().state_bytes));
         let batch = (!rows.is_empty()).then_some(RowBatch { stamp: state.stamp, rows });
         self.write_queue.submit(batch, state, with_state)

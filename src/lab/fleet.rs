@@ -1,5 +1,6 @@
 //! Processes many logs at once. [`whatif`] evaluates the alarms under other settings, [`export`] writes the results as
-//! tables, and [`vehicles`] writes the same tables for a fleet of vehicles on several machines.
+//! tables, and [`vehicles`] writes the same tables for a fleet of vehicles on several machines. [`prior`] combines what
+//! the vehicles of a fleet have learned about their cells.
 //!
 //! Input: a configuration, and logs in any format that `replay` reads. Each log is replayed separately (in a fleet, all
 //! logs of a vehicle together), and all cores are used. If a log cannot be replayed, the error is reported and the
@@ -8,6 +9,7 @@
 pub mod drive;
 pub mod export;
 pub mod judge;
+pub mod prior;
 mod track;
 pub mod truth;
 mod variant_batch;

@@ -15,7 +15,7 @@ mod shape;
 mod standards;
 
 pub use condition::{Condition, Known, Quantity, Terms};
-pub use document::{details, passport};
+pub use document::{details, passport, template, without_nulls};
 pub use field::{Field, Standard};
 pub use losses::ReadingLimits;
 pub use record::Record;

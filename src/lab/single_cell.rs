@@ -7,6 +7,7 @@
 use std::path::{Path, PathBuf};
 
 use crate::config::{self, Config, ConfigFaults, ConfigFiles};
+use packwatch_host::bounded_file;
 
 /// The built-in configuration and the files that it names.
 const BUILT_IN: [(&str, &[u8]); 2] =
@@ -53,11 +54,11 @@ impl CellSource {
         config::cell_model::load(cell)?;
         let read = |file: &Path| {
             let known = BUILT_IN.iter().find(|(name, _)| built_in && Path::new(name) == file);
-            known.map_or_else(|| std::fs::read(file), |(_, bytes)| Ok(bytes.to_vec()))
+            known.map_or_else(|| bounded_file::read(file), |(_, bytes)| Ok(bytes.to_vec()))
         };
         let files = if built_in { ConfigFiles::alone(&path) } else { ConfigFiles::find(&path)? };
         let named = named_cell(&files, &read)?;
-        let read = |file: &Path| if file == named { std::fs::read(cell) } else { read(file) };
+        let read = |file: &Path| if file == named { bounded_file::read(cell) } else { read(file) };
         config::load_with(&files, &read)
     }
 }

@@ -4,9 +4,9 @@
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
-use packwatch_uplink::{Options, kuksa, mqtt, vss};
+use packwatch_uplink::{Options, kuksa, mqtt, sovd, vss};
 
-/// Send the status of the packwatch daemon to MQTT brokers and KUKSA databrokers.
+/// Send the status of the packwatch daemon to MQTT brokers, KUKSA databrokers and SOVD testers.
 #[derive(Debug, Parser)]
 #[command(name = "packwatch-uplink", version, about, propagate_version = true)]
 struct Cli {
@@ -20,6 +20,8 @@ enum Command {
     Mqtt(Options),
     /// Provide the status of the running daemon to a KUKSA databroker
     Kuksa(Options),
+    /// Serve values and faults as a component of ASAM SOVD (read-only JSON over HTTP on this computer)
+    Sovd(Options),
     /// Write the overlay of the Vehicle Signal Specification (VSS) for KUKSA
     Vss(vss::Args),
 }
@@ -28,6 +30,7 @@ fn main() -> ExitCode {
     let result = match Cli::parse().command {
         Command::Mqtt(options) => mqtt::run(&options),
         Command::Kuksa(options) => kuksa::run(&options),
+        Command::Sovd(options) => sovd::run(&options),
         Command::Vss(args) => vss::run(&args),
     };
     match result {

@@ -7,7 +7,7 @@ use packwatch_host::logging;
 use crate::Failure;
 use crate::settings::Settings;
 
-/// Options of `mqtt` and `kuksa`.
+/// Options of `mqtt`, `kuksa` and `sovd`.
 #[derive(Debug, clap::Args)]
 pub struct Options {
     /// Settings file of the uplink

@@ -13,6 +13,7 @@ use serde::Deserialize;
 use crate::files;
 use crate::kuksa::settings::KuksaSettings;
 use crate::mqtt::settings::MqttSettings;
+use crate::sovd::settings::SovdSettings;
 
 /// Contents of the file.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Deserialize)]
@@ -24,6 +25,8 @@ pub struct Settings {
     pub mqtt: Option<MqttSettings>,
     /// The KUKSA databroker.
     pub kuksa: KuksaSettings,
+    /// The SOVD server.
+    pub sovd: SovdSettings,
 }
 
 /// The daemon's status.
@@ -88,6 +91,8 @@ mod tests {
         assert_eq!(fault("[mqtt]\nperiod_s = 0\n"), "2: period_s = 0, must be 1 to 3600");
         assert_eq!(fault("[mqtt.history]\nmax_bytes = -1"), "2: max_bytes = -1, must be 100000 to 100000000000");
         assert!(fault("[mqtt]\ntopic = \"a/#\"").starts_with("2: topic = \"a/#\", must be a topic"));
+        let listen = "[sovd]\nlisten = \"0.0.0.0:9560\"";
+        assert!(fault(listen).starts_with("2: listen = \"0.0.0.0:9560\", must be an address of this computer"));
         assert!(fault("[mqtt]\nport = 70000").starts_with("2: "), "{}", fault("[mqtt]\nport = 70000"));
     }
 

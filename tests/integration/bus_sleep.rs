@@ -92,6 +92,37 @@ fn restart_at_night_finds_sleeping_bus() {
 }
 
 #[test]
+fn sleeping_bus_carries_only_changes_unless_configured() {
+    let extra = "[[alarm]]\nrule = \"store_failed\"\nwarning = 10\n[[alarm]]\nrule = \"soc_low\"\ninfo = 0.9\n\
+                 [j1939]\naddress = 249\nidentity_number = 1\nmanufacturer_code = 2047\n";
+    let mut rig = park(Rig::new(&format!("{ALARMS}{extra}")));
+    fall_silent(&mut rig);
+    rig.seconds(60);
+    let frames_of = |rig: &mut Rig, seconds: i64| {
+        rig.frames.clear();
+        rig.seconds(seconds);
+        rig.frames.len()
+    };
+    assert_eq!(frames_of(&mut rig, HOUR), 0, "an alarm is raised, but nothing changes");
+    rig.give(Record::store(rig.now(), false));
+    frames_of(&mut rig, 60);
+    let wire = rig.wire();
+    assert!(wire.len() == 4 && wire.iter().all(|wire| wire.rule == Rule::StoreFailed as u8), "{wire:?}");
+    assert!(rig.frames.len() <= 10, "the other frames are DM1: {:?}", rig.frames);
+    assert_eq!(frames_of(&mut rig, HOUR), 0);
+    rig.restart(Downtime::Seconds(60.0));
+    frames_of(&mut rig, 60);
+    assert_eq!(frames_of(&mut rig, HOUR), 0, "after a restart");
+    rig.reload(|config| config.output.as_mut().unwrap().while_asleep = true).unwrap();
+    assert!(frames_of(&mut rig, 60) > 700);
+    rig.reload(|config| config.output.as_mut().unwrap().while_asleep = false).unwrap();
+    frames_of(&mut rig, 1);
+    assert_eq!(frames_of(&mut rig, 60), 0);
+    come_back(&mut rig);
+    assert!(frames_of(&mut rig, 1) > 10, "awake");
+}
+
+#[test]
 fn silence_under_load_raises_fault() {
     let mut rig = parked();
     rig.current_a = Some(5.0);

@@ -7,6 +7,10 @@ use std::process::Stdio;
 use std::time::{Duration, Instant};
 
 use assert_cmd::Command;
+use packwatch::cell::chemistry::ResistanceFactors;
+use packwatch::cell::{Chemistry, Label, OwnModel};
+use packwatch::filter::ScalarGaussian;
+use packwatch::lab::fleet::vehicle::LearnedModel;
 use parquet::file::reader::{FileReader, SerializedFileReader};
 use parquet::record::RowAccessor;
 use serde_json::Value;
@@ -51,11 +55,16 @@ impl Fleet {
         command
     }
 
-    /// Replays a part of the fleet and returns the command's output.
+    /// Replays a part of the fleet and returns the command's output. The exit code must be 1 if a vehicle failed.
     fn run(&self, out: &str, more: &[&str]) -> String {
         let mut command = self.command(&["fleet", "run", "fleet.jsonl", "--estimates", "60", "-o", out, "-c"]);
-        let ran = command.arg(config()).args(more).assert().success();
-        String::from_utf8(ran.get_output().stdout.clone()).unwrap()
+        let ran = command.arg(config()).args(more).output().unwrap();
+        let printed = String::from_utf8(ran.stdout).unwrap();
+        let has_failed = printed.contains("failed: ") || printed.contains("\"failed\"");
+        assert_eq!(ran.status.code(), Some(i32::from(has_failed)), "{printed}");
+        let error = String::from_utf8(ran.stderr).unwrap();
+        assert_eq!(error.contains(" vehicles failed\n"), has_failed, "{error}");
+        printed
     }
 
     /// The bytes of the merged tables.
@@ -212,7 +221,7 @@ fn inconsistent_parts_are_not_merged() {
     assert!(merge(&["logs"]).contains("logs/six: incomplete"), "{}", merge(&["logs"]));
     assert!(merge(&["nowhere"]).contains("nowhere: cannot be read"));
     let mut command = fleet.command(&["fleet", "run", "fleet.jsonl", "--shard", "2/2", "-o", "second", "-c"]);
-    command.arg(config()).assert().success();
+    command.arg(config()).output().unwrap();
     let error = merge(&["first", "second"]);
     assert!(error.contains("unlike others: run it again") && error.contains("estimate"), "{error}");
     assert!(!fleet.path("merged").exists());
@@ -240,4 +249,85 @@ fn vehicle_specific_configuration_is_used() {
     assert!(printed.contains("5 vehicles replayed, 0 already complete, 2 failed"), "{printed}");
     fs::write(fleet.path("fleet.jsonl"), own.replace("missing.toml", config().to_str().unwrap())).unwrap();
     assert!(fleet.run("out", &[]).contains("1 vehicles replayed, 5 already complete, 1 failed"));
+}
+
+/// A model that a vehicle could have learned: the label's curve with another capacity.
+fn learned(label: &Label, capacity_ah: f64) -> LearnedModel {
+    let prior = label.prior().unwrap();
+    let (modes_v, rest_v) = prior.curve.modes_v();
+    let array = |values: &[f64]| std::array::from_fn(|s| values[s]);
+    let own = OwnModel {
+        curve_v: array(&prior.curve.mean_v),
+        modes_v: modes_v.each_ref().map(|mode_v| array(mode_v)),
+        rest_v: array(&rest_v),
+        factors: ResistanceFactors::default(),
+        drop_std: [0.1; 4],
+        cold_sag_v: ScalarGaussian::from_std(0.015, 0.015),
+        capacity: ScalarGaussian::from_std(capacity_ah, 0.02 * capacity_ah),
+        residual_v: 0.005,
+    };
+    LearnedModel { label: *label, own }
+}
+
+#[test]
+fn prior_of_fleet_is_reproducible_and_configures_vehicle() {
+    let fleet = Fleet { folder: tempfile::tempdir().unwrap() };
+    let (nmc, nca) = (Label::usual(Chemistry::Nmc811Graphite, 2.6), Label::usual(Chemistry::NcaGraphite, 2.9));
+    let write = |folder: &str, models: &[LearnedModel]| {
+        fs::create_dir_all(fleet.path(folder)).unwrap();
+        let lines = models.iter().map(|model| serde_json::to_string(model).unwrap() + "\n").collect::<String>();
+        fs::write(fleet.path(folder).join("models.jsonl"), lines).unwrap();
+    };
+    let models = [2.3, 2.4, 2.5, 2.4].map(|capacity_ah| learned(&nmc, capacity_ah));
+    write("none", &[]);
+    write("two", &models[..2]);
+    write("tables", &[&models[..], &[learned(&nca, 2.8)]].concat());
+    for (args, wanted) in [
+        (&["none"][..], "models of 0 wanted labels, must be 1 (vehicles with a model: none)"),
+        (&["two"], "2 vehicles have a model of nmc811-graphite 2.6 Ah, 2.5 to 4.2 V, must be at least 3"),
+        (
+            &["tables"],
+            "models of 2 wanted labels, must be 1 (vehicles with a model: nmc811-graphite 2.6 Ah, 2.5 to 4.2 V: 4; nca",
+        ),
+        (&["missing"], "missing/models.jsonl: "),
+    ] {
+        let said = fleet.refused(&[&["fleet", "prior"], args].concat());
+        assert!(said.contains(wanted), "{args:?}: {said}");
+    }
+    let args = ["fleet", "prior", "tables", "--chemistry", "nmc811-graphite", "-o"];
+    for out in ["one.toml", "two.toml"] {
+        let ran = fleet.command(&args).arg(out).assert().success();
+        let said = String::from_utf8(ran.get_output().stdout.clone()).unwrap();
+        assert!(said.contains(": 4 vehicles, nmc811-graphite 2.6 Ah, 2.5 to 4.2 V; capacity 2.400 ± "), "{said}");
+    }
+    let text = fs::read_to_string(fleet.path("one.toml")).unwrap();
+    assert!(text == fs::read_to_string(fleet.path("two.toml")).unwrap(), "the same fleet gives the same bytes");
+
+    // A vehicle starts from the file; a file for another label or a damaged file is refused.
+    let configure = |rated_ah: f64, prior: &str| {
+        let cell = format!("chemistry = \"nmc811-graphite\"\nrated_capacity_ah = {rated_ah}\nprior = \"{prior}\"");
+        let demo = fs::read_to_string(config()).unwrap();
+        let demo = demo.replace("cell_model = \"cells/example_nmc_2600.toml\"", &cell);
+        let dbc = config().with_file_name("measured.dbc");
+        fs::write(fleet.path("car.toml"), demo.replace("measured.dbc", dbc.to_str().unwrap())).unwrap();
+    };
+    configure(2.6, "one.toml");
+    fleet.command(&["check", "car.toml"]).assert().success();
+    fs::write(fleet.path("damaged.toml"), text.replace("[mean.capacity]\nmean = ", "[mean.capacity]\nmean = -"))
+        .unwrap();
+    fs::write(fleet.path("list.toml"), "names = []").unwrap();
+    for (rated_ah, prior, wanted) in [
+        (
+            2.5,
+            "one.toml",
+            "is for nmc811-graphite 2.6 Ah, 2.5 to 4.2 V, must be for the cells of [pack]: nmc811-graphite 2.5 Ah",
+        ),
+        (2.6, "damaged.toml", "the capacity of a learned model is -2.4"),
+        (2.6, "list.toml", "must be a file of `packwatch fleet prior`: list.toml: unknown field `names`"),
+        (2.6, "missing.toml", "must be a file of `packwatch fleet prior`: missing.toml: No such file"),
+    ] {
+        configure(rated_ah, prior);
+        let said = fleet.refused(&["check", "car.toml"]);
+        assert!(said.contains("pack.prior = ") && said.contains(wanted), "{prior}: {said}");
+    }
 }

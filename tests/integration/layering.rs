@@ -26,28 +26,34 @@ const TABLE: &[(&str, &[&str], Core)] = &[
     ("wiring", &["quantity", "filter", "can", "sample", "cell", "monitor"], Core::Pure),
     ("ident", &["quantity", "filter", "regress", "cell"], Core::Pure),
     ("formats", &["quantity", "can"], Core::Shell),
-    ("config", CORE, Core::Shell),
+    ("bounded_file", &[], Core::Shell),
+    ("config", BELOW_CONFIG, Core::Shell),
     ("token_bucket", &["quantity"], Core::Shell),
-    ("io", MODULES.split_at(13).0, Core::Shell),
-    ("logging", MODULES.split_at(14).0, Core::Shell),
-    ("control", MODULES.split_at(15).0, Core::Shell),
-    ("store", MODULES.split_at(16).0, Core::Shell),
-    ("status", MODULES.split_at(16).0, Core::Shell),
-    ("service", MODULES.split_at(18).0, Core::Shell),
-    ("exporter", MODULES.split_at(19).0, Core::Shell),
-    ("replay", MODULES.split_at(19).0, Core::Shell),
-    ("wiring_check", MODULES.split_at(19).0, Core::Shell),
+    ("io", MODULES.split_at(14).0, Core::Shell),
+    ("logging", MODULES.split_at(15).0, Core::Shell),
+    ("control", MODULES.split_at(16).0, Core::Shell),
+    ("store", MODULES.split_at(17).0, Core::Shell),
+    ("status", MODULES.split_at(17).0, Core::Shell),
+    ("service", MODULES.split_at(19).0, Core::Shell),
+    ("http", &["io"], Core::Shell),
+    ("exporter", MODULES.split_at(21).0, Core::Shell),
+    ("replay", MODULES.split_at(20).0, Core::Shell),
+    ("wiring_check", MODULES.split_at(20).0, Core::Shell),
     ("failure", &["config"], Core::Shell),
     ("lab", BELOW_LAB, Core::Shell),
     // A separate program: it reads the daemon's status and uses nothing of the daemon's loop.
-    ("uplink", &["quantity", "alarm", "monitor", "io", "logging", "control", "status", "failure"], Core::Shell),
+    (
+        "uplink",
+        &["quantity", "cell_faults", "alarm", "monitor", "io", "logging", "control", "status", "http", "failure"],
+        Core::Shell,
+    ),
     ("python", &MODULES, Core::Shell),
     ("cli", &MODULES, Core::Shell),
     ("main", &["cli"], Core::Shell),
 ];
 
 /// The modules of `src/core` and `src/host`, lowest first, then the lab's modules.
-const MODULES: [&str; 26] = [
+const MODULES: [&str; 28] = [
     "quantity",
     "filter",
     "can",
@@ -59,6 +65,7 @@ const MODULES: [&str; 26] = [
     "monitor",
     "sim",
     "wiring",
+    "bounded_file",
     "config",
     "token_bucket",
     "io",
@@ -67,6 +74,7 @@ const MODULES: [&str; 26] = [
     "store",
     "status",
     "service",
+    "http",
     "exporter",
     "replay",
     "wiring_check",
@@ -75,8 +83,8 @@ const MODULES: [&str; 26] = [
     "ident",
     "lab",
 ];
-const CORE: &[&str] = MODULES.split_at(11).0;
-const BELOW_LAB: &[&str] = MODULES.split_at(25).0;
+const BELOW_CONFIG: &[&str] = MODULES.split_at(12).0;
+const BELOW_LAB: &[&str] = MODULES.split_at(27).0;
 /// Crates under `src`. `Some`: the table has one row for the whole crate.
 const CRATES: [(&str, Option<&str>); 7] = [
     ("core", None),

@@ -9,7 +9,7 @@ use packwatch::alarm::{Change, Rule};
 use packwatch::can::Frame;
 use packwatch::can::encode::InputEncoder;
 use packwatch::cell::own_model::task::FitFindings;
-use packwatch::cell::{Branch, CellModel, Chemistry, Table};
+use packwatch::cell::{Branch, CellModel, Chemistry, FleetPrior, Table};
 use packwatch::config::{self, ConfigFiles};
 use packwatch::monitor::{Downtime, Event, EventKind, ModelState, Monitor, MonitorConfig, Outputs, Record, Snapshot};
 use packwatch::quantity::{BusIndex, CellIndex, Channel, Timestamp};
@@ -30,12 +30,22 @@ fn configuration(chemistry: &str) -> MonitorConfig {
 
 /// The monitor's configuration; `more` contains further tables.
 fn configuration_with(chemistry: &str, more: &str) -> MonitorConfig {
+    configuration_from(chemistry, more, None)
+}
+
+/// Like [`configuration_with`], with the text of a fleet's prior.
+fn configuration_from(chemistry: &str, more: &str, fleet: Option<&str>) -> MonitorConfig {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
     let text = std::fs::read_to_string(folder.join("score.toml")).unwrap();
-    let label = format!("chemistry = \"{chemistry}\"\nrated_capacity_ah = {RATED_AH}");
+    let prior = fleet.map_or("", |_| "\nprior = \"fleet.toml\"");
+    let label = format!("chemistry = \"{chemistry}\"\nrated_capacity_ah = {RATED_AH}{prior}");
     let text = text.replace("cell_model = \"cells/example_nmc_2600.toml\"", &label) + more;
     let path = folder.join("label.toml");
-    let read = |file: &Path| if file == path { Ok(text.clone().into_bytes()) } else { std::fs::read(file) };
+    let read = |file: &Path| match fleet {
+        _ if file == path => Ok(text.clone().into_bytes()),
+        Some(fleet) if file.ends_with("fleet.toml") => Ok(fleet.as_bytes().to_vec()),
+        _ => std::fs::read(file),
+    };
     config::load_with(&ConfigFiles::alone(&path), &read)
         .unwrap_or_else(|faults| panic!("{}", faults.0.join("\n")))
         .monitor
@@ -307,4 +317,41 @@ fn corrected_label_keeps_rows_and_discards_model() {
     let view = corrected.monitor.model();
     assert!(view.notebook.map_or(0, |notebook| notebook.rows().len()) >= rows);
     assert!(matches!(view.state, ModelState::Learning | ModelState::Learned), "{:?}", view.state);
+}
+
+#[test]
+fn vehicle_starts_from_what_a_fleet_has_learned() {
+    let config = configuration("nmc811-graphite");
+    let truth = true_model(&config);
+    let swings = [DEEP[0], PARTIAL[0], PARTIAL[1]];
+    let learned = [4.5, 4.6, 4.8, 4.9].map(|capacity_ah| {
+        let mut live = Live::new(&config);
+        vehicle(&truth, &config, capacity_ah, &swings, 3).iter().for_each(|frame| live.take(frame));
+        live.give(Record::unknown_gap(Timestamp::from_secs(4e9)));
+        live.monitor.model().own.expect("a learned model").clone()
+    });
+    let label = config.label.unwrap();
+    let fleet = FleetPrior::new(&label, &learned).unwrap();
+    fleet.check().unwrap();
+    let capacity = fleet.mean.capacity;
+    assert!((capacity.mean - TRUE_AH).abs() < 0.15 && (0.17..0.5).contains(&capacity.std()), "{capacity:?}");
+    let model = fleet.cell_model().unwrap();
+    let ohm = |model: &CellModel| model.settled_ohm(&model.grid_position(0.5, 25.0));
+    assert!((ohm(&model) / ohm(&truth) - 1.0).abs() < 0.1 * ohm(&config.model) / ohm(&truth));
+
+    // The configuration reads the file of the fleet.
+    let text = toml::to_string(&fleet).unwrap();
+    let prior = configuration_from("nmc811-graphite", "", Some(&text));
+    assert_eq!(prior.fleet.as_ref(), Some(&fleet));
+    assert_eq!(prior.model.capacity_ah, model.capacity_ah);
+    let frames = vehicle(&truth, &config, TRUE_AH, &[(0.25, 0.85)], 1);
+    let errors = [&config, &prior].map(|config| {
+        let mut live = Live::new(config);
+        frames.iter().for_each(|frame| live.take(frame));
+        let last = live.monitor.latest().next().flatten().unwrap();
+        // The cell ends its cycle at the upper end of its range.
+        (last.soc - 0.85, last.soc_std)
+    });
+    let [(_, label_std), (off, std)] = errors;
+    assert!(std < 0.8 * label_std && off.abs() < 1.96 * std, "{errors:?}");
 }

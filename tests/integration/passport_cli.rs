@@ -316,6 +316,50 @@ fn battery_pass_adds_measured_values_to_static_part() {
     assert_eq!(pass, manufacturer(), "no other value may be added or changed");
 }
 
+#[test]
+fn static_template_is_accepted_once_filled_in() {
+    let life = Life::new();
+    let (log, config) = (life.path("life.log"), life.path("pack.toml"));
+    let template = passport(&["--form", "battery-pass", "--static-template"]);
+    // It has a place for everything that the manufacturer states, and none for a measured value.
+    let mut filled = template.clone();
+    fill_in(&mut filled, &manufacturer());
+    assert!(template.pointer("/performance/dynamic/fullCycles").is_none(), "{template}");
+    let filled = life.write("filled.json", &filled);
+    let args = ["-c", &config, &log, "--throughput-before-ah", "0", "--certified-energy-kwh", "0.014", "--form"];
+    let args = [&args[..], &["battery-pass", "--static"]].concat();
+    let plain = life.write("manufacturer.json", &manufacturer());
+    assert_eq!(passport(&with_file(&args, &filled)), passport(&with_file(&args, &plain)));
+    let empty = life.write("empty.json", &template);
+    assert!(
+        refused(&with_file(&[&["passport"], &args[..]].concat(), &empty))
+            .contains("materials: required, but no record")
+    );
+}
+
+fn with_file<'a>(args: &[&'a str], file: &'a str) -> Vec<&'a str> {
+    args.iter().copied().chain([file]).collect()
+}
+
+/// Replaces the values of a template by those of `known`; every value must have its place.
+fn fill_in(template: &mut Value, known: &Value) {
+    match (template, known) {
+        (Value::Object(members), Value::Object(known)) => known.iter().for_each(|(name, value)| {
+            fill_in(members.get_mut(name).unwrap_or_else(|| panic!("no {name}")), value);
+        }),
+        (template @ Value::Array(_), Value::Array(known)) => {
+            let item = template[0].clone();
+            let fill = |known: &Value| {
+                let mut item = item.clone();
+                fill_in(&mut item, known);
+                item
+            };
+            *template = known.iter().map(fill).collect();
+        }
+        (template, known) => *template = known.clone(),
+    }
+}
+
 /// JSON pointers to every member of all objects in a document.
 fn members(document: &Value, at: &str, found: &mut Vec<String>) {
     match document {

@@ -25,7 +25,7 @@ from kuksa.val.v2 import val_pb2_grpc as rpc_v2
 
 TYPES = {name: number for number, name in enumerate(
     "string boolean int8 int16 int32 int64 uint8 uint16 uint32 uint64 float double".split(), start=1)}
-FIELDS = {"string": "string", "boolean": "bool", "uint8": "uint32", "uint16": "uint32", "uint32": "uint32", "float": "float",
+FIELDS = {"string": "string", "boolean": "bool", "uint8": "uint32", "uint16": "uint32", "uint32": "uint32", "uint64": "uint64", "float": "float",
           "double": "double", "string[]": "string_array", "boolean[]": "bool_array", "float[]": "float_array"}
 
 

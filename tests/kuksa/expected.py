@@ -13,6 +13,8 @@ VSS = {
     "CellVoltage.Min": "float", "CellVoltage.IdMin": "uint16", "CellVoltage.Max": "float", "CellVoltage.IdMax": "uint16",
     "CellVoltage.CellVoltages": "float[]", "StateOfCharge.Current": "float", "StateOfCharge.CurrentEnergy": "float",
     "Charging.TimeToComplete": "uint32", "StateOfHealth": "float", "ErrorCodes": "string[]",
+    "TimeRemaining": "uint32", "AccumulatedChargedThroughput": "float", "AccumulatedConsumedThroughput": "float",
+    "AccumulatedChargedEnergy": "float", "AccumulatedConsumedEnergy": "float", "TotalEnergyThroughput": "uint64",
     # Signals of VSS that packwatch does not provide.
     "NetCapacity": "uint16", "StateOfCharge.Displayed": "float", "Charging.IsCharging": "boolean", "Range": "uint32",
 }
@@ -36,6 +38,7 @@ def array(cells, key, factor=1.0):
 
 def standard(document):
     pack, cells, alarms = document["pack"], document["cells"], document["alarms"]
+    moved = pack["moved"] or {}
     volts, temperatures = array(cells, "voltage_v"), array(cells, "temperature_c")
     power = None if None in (pack["current_a"], pack["voltage_v"]) else single(-pack["current_a"] * pack["voltage_v"])
     raised = [alarm for alarm in alarms["list"] if alarm["state"] in ("active", "clearing", "suppressed", "latched")]
@@ -61,6 +64,12 @@ def standard(document):
         "Charging.TimeToComplete": None if pack["time_to_full_s"] is None else round(single(pack["time_to_full_s"])),
         "StateOfHealth": None if (pack["soh"] or 0) > 1 else scaled(pack["soh"], 100.0),
         "ErrorCodes": codes,
+        "TimeRemaining": None if pack["time_to_empty_s"] is None else round(pack["time_to_empty_s"]),
+        "AccumulatedChargedThroughput": single(moved.get("charged_ah")),
+        "AccumulatedConsumedThroughput": single(moved.get("discharged_ah")),
+        "AccumulatedChargedEnergy": scaled(moved.get("charged_wh"), 1e-3),
+        "AccumulatedConsumedEnergy": scaled(moved.get("discharged_wh"), 1e-3),
+        "TotalEnergyThroughput": round(moved["charged_wh"] + moved["discharged_wh"]) if moved else None,
     }
 
 

@@ -2,17 +2,15 @@
 
 use std::path::Path;
 
+use packwatch_host::bounded_file;
 use packwatch_host::failure::Failure;
 
 use super::output::named;
 use crate::can::dbc::{Database, DbcError};
 
-/// Maximum size of a text file, bytes. The largest known signal set has 0.5 MB.
-const MAX_BYTES: u64 = 64 << 20;
-
 /// Reads a DBC file. Prints a warning for each message that is left out.
 pub(crate) fn database(file: &Path) -> Result<Database, Failure> {
-    let bytes = std::fs::read(file).map_err(|error| unreadable(file, &error))?;
+    let bytes = bounded_file::read(file).map_err(|error| unreadable(file, &error))?;
     let at = |fault: &DbcError| format!("{}:{}", file.display(), fault.line);
     let database =
         Database::parse_bytes(&bytes).map_err(|fault| Failure::new(format!("{}: {}", at(&fault), fault.what)))?;
@@ -22,13 +20,9 @@ pub(crate) fn database(file: &Path) -> Result<Database, Failure> {
     Ok(database)
 }
 
-/// Reads a text file of at most [`MAX_BYTES`].
+/// Reads a text file.
 pub(crate) fn read(file: &Path) -> Result<String, Failure> {
-    let bytes = std::fs::metadata(file).map_err(|error| unreadable(file, &error))?.len();
-    if bytes > MAX_BYTES {
-        return Err(named(file, format!("{bytes} bytes, must be at most {MAX_BYTES}")));
-    }
-    std::fs::read_to_string(file).map_err(|error| unreadable(file, &error))
+    bounded_file::read_text(file).map_err(|error| unreadable(file, &error))
 }
 
 fn unreadable(file: &Path, error: &std::io::Error) -> Failure {

@@ -1,6 +1,5 @@
 //! Selects a cell model: from a file, a configuration, a label, or the learned state of a vehicle.
 
-use std::fs::File;
 use std::io::Read as _;
 use std::path::{Path, PathBuf};
 
@@ -12,6 +11,7 @@ use crate::config::{self, Config, of_label, of_view};
 use crate::io::snapshot_file;
 use crate::monitor::Snapshot;
 use crate::store::HistoryReader;
+use packwatch_host::bounded_file;
 use packwatch_host::failure::Failure;
 
 /// Selects a cell model.
@@ -126,14 +126,14 @@ fn of_label_text(path: &Path) -> Result<(String, SourcedModel), Failure> {
 /// Whether a file contains a stored state (JSON), judged by its name or its first byte.
 fn is_snapshot(path: &Path) -> bool {
     let mut first = [0];
-    let read = File::open(path).and_then(|mut file| file.read_exact(&mut first));
+    let read = bounded_file::open(path).and_then(|mut file| file.read_exact(&mut first));
     path.extension().is_some_and(|extension| extension == "json") || (read.is_ok() && first == *b"{")
 }
 
 /// Whether a file is a configuration, that is, contains a table `[pack]`. Faults of the file are reported later, when
 /// it is read.
 fn is_configuration(path: &Path) -> bool {
-    let text = std::fs::read_to_string(path).unwrap_or_default();
+    let text = bounded_file::read_text(path).unwrap_or_default();
     text.parse::<toml::Table>().is_ok_and(|table| table.contains_key("pack"))
 }
 

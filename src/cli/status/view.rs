@@ -6,7 +6,6 @@
 
 mod app;
 mod draw;
-mod event_words;
 mod feed;
 mod pages;
 mod plot;

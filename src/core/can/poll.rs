@@ -55,7 +55,7 @@ pub struct PollRequest {
 pub struct PollConfig {
     /// Requests. If several are due at the same time, the first of them in this list is sent first.
     pub requests: Vec<PollRequest>,
-    /// Maximum number of requests per second, over all requests.
+    /// Maximum number of sent frames (requests and flow control) per second, over all requests.
     pub max_requests_per_s: f64,
     /// Whether a supply voltage is configured. If so, nothing is sent without a good reading of the supply voltage.
     pub watches_supply: bool,
@@ -130,6 +130,9 @@ struct Outstanding {
     index: usize,
     sent: Timestamp,
     deadline: Timestamp,
+    /// Whether the response has received its flow control.
+    #[serde(default)]
+    has_flow_control: bool,
 }
 
 /// Sends diagnostic requests.
@@ -156,6 +159,26 @@ pub struct PollProgress {
     /// Time of the latest frame from other nodes on each polled bus.
     heard: Vec<(BusIndex, Timestamp)>,
     silence: Option<PollSilence>,
+}
+
+impl PollProgress {
+    /// Shifts the time that a restart needs to another clock.
+    pub(crate) fn rebase(&mut self, by_nanos: i64) {
+        self.foreign_until = self.foreign_until.plus_nanos(by_nanos);
+    }
+
+    /// Drops everything that ends with the process. Returns `false` if nothing is left: neither standby nor the silence
+    /// after another tester.
+    pub(crate) fn restart(&mut self, now: Timestamp) -> bool {
+        (self.outstanding, self.latest, self.silence) = (None, None, None);
+        self.items.clear();
+        self.heard.clear();
+        self.is_standby || self.hears_tester(now)
+    }
+
+    fn hears_tester(&self, now: Timestamp) -> bool {
+        now < self.foreign_until
+    }
 }
 
 impl Poller {
@@ -185,6 +208,15 @@ impl Poller {
     /// The progress to store.
     pub fn progress(&self) -> &PollProgress {
         &self.progress
+    }
+
+    /// Restores standby and the silence after another tester, for example after a restart. The tester may have sent
+    /// further requests in the meantime, so its silence starts anew. `taken`: time of the stored progress.
+    pub fn restore_silence(&mut self, stored: &PollProgress, taken: Timestamp, now: Timestamp) {
+        self.progress.is_standby = stored.is_standby;
+        if stored.hears_tester(taken) {
+            self.progress.foreign_until = now.plus_nanos(FOREIGN_SILENCE_NS);
+        }
     }
 
     /// Resumes stored progress, if it belongs to the same configuration.
@@ -267,10 +299,16 @@ impl Poller {
         self.poll(now, out);
     }
 
-    /// Handles the first frame of a multi-frame response to the outstanding request: sends flow control.
+    /// Handles the first frame of a multi-frame response to the outstanding request: sends flow control, but only once
+    /// per request. A controller that sends further first frames gets no more answers; the listener counts their faults.
     pub fn handle_begun(&mut self, now: Timestamp, controller: &Controller, out: &mut PollOutputs) {
         let Some(question) = self.outstanding_of(controller) else { return };
+        let is_first = |outstanding: &mut Outstanding| !std::mem::replace(&mut outstanding.has_flow_control, true);
+        if !self.progress.outstanding.as_mut().is_some_and(is_first) {
+            return;
+        }
         self.extend_wait(now, ANSWER_WITHIN_NS);
+        self.progress.rate_allows_at = self.progress.rate_allows_at.max(now).plus_secs(self.frame_period_s());
         let Controller { bus, request, request_extension, .. } = question.controller;
         let mut payload = [0; 8];
         let bytes = request_extension.iter().chain(&FLOW_CONTROL);
@@ -368,7 +406,7 @@ impl Poller {
         let is_asleep = |(_, at): &(BusIndex, Timestamp)| now.nanos().saturating_sub(at.nanos()) >= ASLEEP_AFTER_NS;
         if self.progress.is_standby {
             Some(PollSilence::Standby)
-        } else if now < self.progress.foreign_until {
+        } else if self.progress.hears_tester(now) {
             Some(PollSilence::OtherTester)
         } else if self.config.watches_supply && now >= self.progress.supply_good_until {
             Some(PollSilence::LowSupply)
@@ -386,6 +424,11 @@ impl Poller {
             .enumerate()
             .filter(|(index, item)| !item.is_refused && self.period_s(*index).is_some());
         waiting.map(|(index, item)| (index, item.due)).min_by_key(|(_, due)| *due)
+    }
+
+    /// Shortest mean period of the sent frames, s.
+    fn frame_period_s(&self) -> f64 {
+        1.0 / self.config.max_requests_per_s
     }
 
     fn period_s(&self, index: usize) -> Option<f64> {
@@ -416,9 +459,10 @@ impl Poller {
         let payload = segment(request_extension, &message, 0);
         out.frames
             .extend(payload.first().and_then(|payload| Frame::classic(request, payload)).map(|frame| (bus, frame)));
-        self.progress.outstanding = Some(Outstanding { index, sent: now, deadline: now.plus_nanos(ANSWER_WITHIN_NS) });
+        let deadline = now.plus_nanos(ANSWER_WITHIN_NS);
+        self.progress.outstanding = Some(Outstanding { index, sent: now, deadline, has_flow_control: false });
         self.progress.latest = Some(index);
-        self.progress.rate_allows_at = now.plus_secs(1.0 / self.config.max_requests_per_s);
+        self.progress.rate_allows_at = now.plus_secs(self.frame_period_s());
         // A request without a period in this state is sent only before a request for voltages.
         let period_s = self.period_s(index).unwrap_or(0.0);
         let item = &mut self.progress.items[index];
@@ -451,12 +495,14 @@ impl Poller {
     }
 }
 
-/// Whether the identifier is one of the request identifiers of ISO 15765-4 (physical or functional), which only testers
-/// use.
+/// Whether only testers use this identifier: the request identifiers of ISO 15765-4 (physical or functional), and those
+/// of BMW (6F1), Volkswagen (710, 17FC00xx) and Renault-Nissan (743).
 fn is_tester(id: CanId) -> bool {
     match id {
-        CanId::Standard(raw) => raw == 0x7DF || (0x7E0..=0x7E7).contains(&raw),
-        CanId::Extended(raw) => matches!(raw & 0x1FFF_00FF, 0x18DA_00F1 | 0x18DB_00F1),
+        CanId::Standard(raw) => matches!(raw, 0x7DF..=0x7E7 | 0x6F1 | 0x710 | 0x743),
+        CanId::Extended(raw) => {
+            matches!(raw & 0x1FFF_00FF, 0x18DA_00F1 | 0x18DB_00F1) || raw & 0x1FFF_FF00 == 0x17FC_0000
+        }
     }
 }
 

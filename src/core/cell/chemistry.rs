@@ -11,10 +11,13 @@
 
 pub mod curve;
 
+use std::fmt;
+
 use serde::{Deserialize, Serialize};
 
 use super::aged_ocv::{AgedOcv, MIXES};
 use super::electrodes::{Electrodes, NegativeMaterial as Negative, PositiveMaterial as Positive};
+use super::fleet_prior::FleetPrior;
 use super::model::{Branch, CellModel, ModelSpread, Table, arrhenius};
 use crate::filter::{ScalarGaussian, interpolate, median};
 use curve::{CellType, CurvePrior, PositiveElectrode};
@@ -113,6 +116,8 @@ pub struct LabelPrior {
     pub model: CellModel,
     /// Open-circuit curve with the covariance between cells.
     pub curve: CurvePrior,
+    /// What other vehicles have learned about cells of this label; `None` = only the label is known.
+    pub fleet: Option<FleetPrior>,
 }
 
 /// SOC breakpoints of a model from a label.
@@ -202,6 +207,13 @@ pub(super) fn usual_cold_sag_v() -> ScalarGaussian {
     ScalarGaussian::from_std(0.015, 0.015)
 }
 
+impl fmt::Display for Label {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { chemistry, rated_ah, voltage_min_v, voltage_max_v } = self;
+        write!(f, "{} {rated_ah} Ah, {voltage_min_v} to {voltage_max_v} V", chemistry.name())
+    }
+}
+
 impl Label {
     /// The label with the chemistry's usual cut-off voltages.
     pub fn usual(chemistry: Chemistry, rated_ah: f64) -> Self {
@@ -260,7 +272,7 @@ impl Label {
         let of_cells = CurveOfCells { mean_v, modes_v, rest_v, cold_sag_v: usual_cold_sag_v(), electrodes };
         let factors = ResistanceFactors::default();
         let model = self.model_of(self.rated_ah, &of_cells, &factors, &[0.0; TEMPERATURE_NODES], spread);
-        Some(LabelPrior { label: *self, model, curve })
+        Some(LabelPrior { label: *self, model, curve, fleet: None })
     }
 
     /// The model of a cell with this present capacity (Ah), curve and resistances. `drop_std` is the standard deviation

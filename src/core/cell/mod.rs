@@ -11,6 +11,7 @@ pub mod config;
 pub mod coverage;
 pub mod electrodes;
 pub mod estimator;
+pub mod fleet_prior;
 pub mod loss_modes;
 pub mod model;
 pub mod model_bands;
@@ -20,7 +21,7 @@ pub mod notebook;
 pub mod own_model;
 
 pub use aged_ocv::{AgedOcv, AgeingLaw};
-pub use chemistry::{Chemistry, Label, LabelPrior};
+pub use chemistry::{Chemistry, Label, LabelPrior, USUAL_LOAD_PER_H};
 pub use config::{
     CapacityState, ConsistencySettings, Discretisation, EstimatorConfig, GapSettings, GateSettings, InitialState,
     ProcessNoise, SensorErrors, SigmaPointSettings, VoltageError,
@@ -31,6 +32,7 @@ pub use estimator::{
     AdoptedState, CellEstimator, CellModule, CellState, CellStep, EstimatorBank, PackBank, StepResult, Update,
     reach_of_error,
 };
+pub use fleet_prior::FleetPrior;
 pub use loss_modes::LossModes;
 pub use model::{
     Branch, CellModel, ERROR_WINDOW_S, GridPosition, MAX_BRANCHES, ModelSpread, Table, TemperaturePosition, Thermal,

@@ -11,6 +11,8 @@
 //! Reason: between nodes with different resistances, the product of the two interpolated values is up to twice the
 //! product at either node. Effect: none where R1 and C1 are constant.
 
+use serde::{Deserialize, Serialize};
+
 use super::aged_ocv::{AgedOcv, AgeingLaw, MIXES, OffsetLine};
 use super::loss_modes::LossModes;
 use crate::filter::{ScalarGaussian, crossing, interpolation, locate};
@@ -90,7 +92,8 @@ pub struct CellModel {
 
 /// Standard deviations of the properties of cells around their model. The modes in which the open-circuit curve varies
 /// between cells are stored with the mixes of losses ([`AgedOcv::add_spread`]).
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct ModelSpread {
     /// Constant error of the open-circuit curve in addition to its modes (V).
     pub curve_v: f64,

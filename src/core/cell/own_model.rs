@@ -44,6 +44,12 @@ pub struct OwnModel {
 impl OwnModel {
     /// The cell model for the filters; `None` if the label has no model.
     pub fn cell_model(&self, label: &Label) -> Option<CellModel> {
+        let name = format!("{} {} Ah (learned)", label.chemistry.name(), label.rated_ah);
+        self.cell_model_with(label, self.spread_within_pack(), name)
+    }
+
+    /// The cell model with a spread between cells and a name; `None` if the label has no model.
+    pub(super) fn cell_model_with(&self, label: &Label, spread: ModelSpread, name: String) -> Option<CellModel> {
         let curve = CurveOfCells {
             mean_v: self.curve_v.to_vec(),
             modes_v: self.modes_v.each_ref().map(|mode_v| mode_v.to_vec()),
@@ -51,7 +57,14 @@ impl OwnModel {
             cold_sag_v: self.cold_sag_v,
             electrodes: label.curve()?.electrodes,
         };
-        let spread = ModelSpread {
+        let mut model = label.model_of(self.capacity.mean, &curve, &self.factors, &self.drop_std, spread);
+        model.name = name;
+        Some(model)
+    }
+
+    /// Spread of the cells of the pack whose model this is.
+    pub(super) fn spread_within_pack(&self) -> ModelSpread {
+        ModelSpread {
             curve_v: median(self.rest_v.iter().copied()).unwrap_or_default(),
             // The cells of one pack are similar.
             log_resistance: 0.1,
@@ -59,10 +72,7 @@ impl OwnModel {
             capacity: self.capacity.std() / self.capacity.mean,
             // The voltage drop has an error of 10 % that persists for 100 s, even with fitted resistances.
             drop_sqrt_s: 1.0,
-        };
-        let mut model = label.model_of(self.capacity.mean, &curve, &self.factors, &self.drop_std, spread);
-        model.name = format!("{} {} Ah (learned)", label.chemistry.name(), label.rated_ah);
-        Some(model)
+        }
     }
 
     /// The estimator's settings for the learned `model`, derived from the settings for the label's model.

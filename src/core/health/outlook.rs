@@ -1,6 +1,6 @@
 //! Outlook: energy, time and power that a pack can deliver or take up from now on.
 //!
-//! In: state and model of every cell ([`CellState`]), the recent load ([`RecentLoad`]) and the limits
+//! In: state and model of every cell ([`CellNow`]), the recent load ([`RecentLoad`]) and the limits
 //! ([`OutlookConfig`]). Out: [`Outlook`] of the pack, with variances. Currents are per cell, positive = discharge.
 //!
 //! * All cells of a series pack carry the same charge. A discharge ends when the first cell is empty, a charge when the
@@ -15,7 +15,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::cell::{CellModel, GridPosition, MAX_BRANCHES};
+use crate::cell::model_bands::CURVE_C;
+use crate::cell::{CellModel, GridPosition, MAX_BRANCHES, USUAL_LOAD_PER_H};
 use crate::filter::{ScalarGaussian, bisect, square};
 use crate::quantity::{CellIndex, InvalidState, Mode, Timestamp};
 
@@ -25,18 +26,18 @@ pub const POWER_S: [f64; 3] = [2.0, 10.0, 30.0];
 const LOAD_S: f64 = 1800.0;
 /// Standard deviation of ln(time that the charger holds the voltage). Models without a slow branch taper too fast.
 const LOG_HELD_STD: f64 = 0.7;
-/// A longer gap without a current is not averaged (s).
-const GAP_S: f64 = 600.0;
+/// A load is known if its mean is at least this share of its RMS value. A smaller share is charged and discharged in turn,
+/// as in a hybrid, so that no discharge can be foreseen.
+const LEAST_MEAN: f64 = 0.1;
 /// Standard deviation of ln(future load over recent load): a driver needs a third more or less in the next half hour.
 const LOG_LOAD_STD: f64 = 0.3;
-/// Time over which the current of a charge is averaged (s). A charger regulates its current.
+/// Time over which the current of a charge is averaged (s). A charger regulates its current. Braking ends sooner, so a
+/// charge counts only after this time. A longer gap between two currents is not averaged.
 const CHARGER_S: f64 = 60.0;
-/// Load that is assumed before the first one was seen, per rated capacity (1/h): a vehicle that drives for five hours.
-const USUAL_LOAD_PER_H: f64 = 0.2;
 /// Halvings of a search for a SOC: 0.02 %.
 const HALVINGS: u32 = 12;
-/// Steps of the search for the current at a voltage limit. The SOC moves by less than 1 % in 30 s at 1C.
-const CURRENT_STEPS: u32 = 4;
+/// Newton's steps of the search for the current at a voltage limit.
+const CURRENT_STEPS: u32 = 5;
 /// Number of intervals of an integral over the charge.
 const INTERVALS: u32 = 8;
 /// Number of steps of a charge.
@@ -75,7 +76,7 @@ struct Average {
     seconds: f64,
     mean_a: f64,
     mean_square_a2: f64,
-    /// Largest current; it falls to the mean in the time of averaging (A).
+    /// Largest current; it decays to the mean with the time of averaging (A).
     peak_a: f64,
 }
 
@@ -88,10 +89,10 @@ impl Average {
         self.peak_a = current_a.max(self.peak_a + weight * (self.mean_a - self.peak_a));
     }
 
-    /// The load of a discharge, if one was seen.
+    /// The load, unless it is unknown.
     fn load(&self) -> Option<Load> {
         let Self { mean_a, mean_square_a2, peak_a, .. } = *self;
-        let is_known = mean_a > 0.0 && self.seconds > 0.0;
+        let is_known = mean_a > LEAST_MEAN * mean_square_a2.sqrt();
         is_known.then(|| Load {
             mean_a,
             mean_square_a2: mean_square_a2.max(square(mean_a)),
@@ -105,18 +106,27 @@ impl RecentLoad {
     pub fn observe(&mut self, now: Timestamp, mode: Mode, current_a: Option<f64>, rest_a: f64) {
         let seconds = self.latest.map_or(0.0, |latest| now.since(latest));
         self.latest = Some(now);
-        let Some(current_a) = current_a.filter(|_| seconds > 0.0 && seconds <= GAP_S) else { return };
+        let Some(current_a) = current_a.filter(|_| seconds > 0.0 && seconds <= CHARGER_S) else { return };
         match mode {
             Mode::Charge => self.charge.add(-current_a, seconds, CHARGER_S),
-            Mode::Rest if current_a.abs() <= rest_a => self.charge = Average::default(),
-            // A load that changes its direction within seconds has no mode, but is a load.
-            Mode::Discharge | Mode::Rest | Mode::Unknown => self.discharge.add(current_a, seconds, LOAD_S),
+            Mode::Rest | Mode::Unknown if current_a.abs() <= rest_a => self.charge = Average::default(),
+            // A current that changes its sign within seconds gives no mode, but still counts as load.
+            Mode::Discharge | Mode::Rest | Mode::Unknown => {
+                self.charge = Average::default();
+                self.discharge.add(current_a, seconds, LOAD_S);
+            }
         }
+    }
+
+    /// Notes that the current before the next one is unknown, after a sleep or a restart.
+    pub fn interrupt(&mut self) {
+        self.latest = None;
     }
 
     /// The charger's current (A, positive), if the pack is being charged.
     fn charger_a(&self, mode: Mode) -> Option<f64> {
-        Some(self.charge.mean_a).filter(|current_a| mode == Mode::Charge && *current_a > 0.0)
+        let is_charger = mode == Mode::Charge && self.charge.seconds >= CHARGER_S;
+        Some(self.charge.mean_a).filter(|current_a| is_charger && *current_a > 0.0)
     }
 
     /// Shifts the time of the latest current by `by_nanos`, to another clock.
@@ -150,7 +160,7 @@ impl Load {
         Self { mean_a, mean_square_a2: square(mean_a), peak_a: mean_a }
     }
 
-    /// The load before one was seen; its largest current is 1C.
+    /// The load that is assumed while none is known: C/2 with a largest current of 1C.
     fn usual(rated_ah: f64) -> Self {
         Self { peak_a: rated_ah, ..Self::constant(USUAL_LOAD_PER_H * rated_ah) }
     }
@@ -162,21 +172,27 @@ impl Load {
         self.mean_a * settled_ohm + fluctuation_a * fast_ohm
     }
 
+    /// The load with all currents multiplied by `factor`.
+    fn times(&self, factor: f64) -> Self {
+        let Self { mean_a, mean_square_a2, peak_a } = *self;
+        Self { mean_a: factor * mean_a, mean_square_a2: square(factor) * mean_square_a2, peak_a: factor * peak_a }
+    }
+
     /// Voltage drop at the largest current (V).
     fn peak_v(&self, settled_ohm: f64, fast_ohm: f64) -> f64 {
         self.mean_a * settled_ohm + (self.peak_a - self.mean_a) * fast_ohm
     }
 }
 
-/// State of one cell.
+/// What is known about one cell.
 #[derive(Debug, Clone, Copy)]
-pub struct CellState<'a> {
+pub struct CellNow<'a> {
     pub model: &'a CellModel,
     /// State of charge, fraction.
     pub soc: ScalarGaussian,
     /// Capacity (Ah).
     pub capacity: ScalarGaussian,
-    /// ln of the resistance relative to the model.
+    /// ln of the resistance relative to the model, with the model's own error at this SOC and temperature.
     pub log_resistance: ScalarGaussian,
     /// Additional resistance ratio of the slowest branch.
     pub slow_ratio: f64,
@@ -193,7 +209,15 @@ enum Direction {
     Charge,
 }
 
-impl CellState<'_> {
+impl CellNow<'_> {
+    fn min_v(&self, config: &OutlookConfig) -> f64 {
+        config.min_voltage_v.unwrap_or(self.model.voltage_min_v)
+    }
+
+    fn max_v(&self, config: &OutlookConfig) -> f64 {
+        config.max_voltage_v.unwrap_or(self.model.voltage_max_v)
+    }
+
     fn position(&self, soc: f64) -> GridPosition {
         self.model.grid_position(soc, self.temperature_c)
     }
@@ -213,52 +237,22 @@ impl CellState<'_> {
         libm::exp(self.log_resistance.mean) * (0..=slowest).fold(model.r0_ohm(&position), |sum, i| sum + response(i))
     }
 
-    /// Voltage (V) at a load: the mean, and the lowest at the largest current.
-    fn loaded_v(&self, soc: f64, load: &Load) -> (f64, f64) {
-        let (ocv_v, settled_ohm) = (self.ocv_v(soc), self.ohm(soc, f64::INFINITY));
-        let [peak_ohm, fast_ohm, _] = POWER_S.map(|after_s| self.ohm(soc, after_s));
-        (ocv_v - load.loss_v(settled_ohm, fast_ohm), ocv_v - load.peak_v(settled_ohm, peak_ohm))
+    /// Mean voltage at a load (V), at least the lowest voltage.
+    fn loaded_v(&self, soc: f64, load: &Load, config: &OutlookConfig) -> f64 {
+        let loss_v = load.loss_v(self.ohm(soc, f64::INFINITY), self.ohm(soc, POWER_S[1]));
+        (self.ocv_v(soc) - loss_v).max(self.min_v(config))
     }
 
     /// SOC at which the voltage at the largest current of the load falls to the lowest voltage.
     fn empty_soc(&self, load: &Load, config: &OutlookConfig) -> f64 {
-        let min_v = config.min_voltage_v.unwrap_or(self.model.voltage_min_v);
-        let is_empty = |soc: f64| self.loaded_v(soc, load).1 < min_v;
+        let peak_v = |soc: f64| load.peak_v(self.ohm(soc, f64::INFINITY), self.ohm(soc, POWER_S[0]));
+        let is_empty = |soc: f64| self.ocv_v(soc) - peak_v(soc) < self.min_v(config);
         if is_empty(0.0) { bisect((0.0, 1.0), HALVINGS, is_empty).1 } else { 0.0 }
     }
 
     /// Charge (Ah) that the cell delivers at this load until it is empty.
     fn dischargeable_ah(&self, load: &Load, config: &OutlookConfig) -> f64 {
         self.capacity.mean * (self.soc.mean - self.empty_soc(load, config)).max(0.0)
-    }
-
-    /// Charge (Ah) and energy (Wh) that the cell delivers until it is empty, with variances. Resistance and load have
-    /// the same effect: on the voltage, and on the SOC of the empty cell.
-    fn remaining(&self, load: &Load, config: &OutlookConfig) -> [ScalarGaussian; 2] {
-        let (capacity_ah, soc) = (self.capacity.mean, self.soc.mean);
-        let empty = self.empty_soc(load, config);
-        let charge_ah = capacity_ah * (soc - empty).max(0.0);
-        let energy_wh = self.delivered_wh(charge_ah, load);
-        let (now_v, _) = self.loaded_v(soc, load);
-        let (end_v, end_peak_v) = self.loaded_v(empty, load);
-        let slope_v = (self.loaded_v(empty + 0.01, load).1 - end_peak_v) / 0.01;
-        let peak_drop_v = self.ocv_v(empty) - end_peak_v;
-        let empty_by_log = if empty > 0.0 && slope_v > 0.0 { (peak_drop_v / slope_v).min(1.0) } else { 0.0 };
-        let loss_wh = charge_ah * (mean_of(|part| self.ocv_v(soc + part * (empty - soc)))) - energy_wh;
-        let log_variance = self.log_resistance.variance + square(LOG_LOAD_STD);
-        let variance = |by_soc: f64, by_log: f64, value: f64| {
-            square(by_soc) * self.soc.variance
-                + square(value / capacity_ah) * self.capacity.variance
-                + square(by_log) * log_variance
-        };
-        let by_log_ah = capacity_ah * empty_by_log;
-        [
-            ScalarGaussian { mean: charge_ah, variance: variance(capacity_ah, by_log_ah, charge_ah) },
-            ScalarGaussian {
-                mean: energy_wh,
-                variance: variance(capacity_ah * now_v, loss_wh + by_log_ah * end_v, energy_wh),
-            },
-        ]
     }
 
     /// Charge (Ah) that the cell takes up until it is full: until the taper current keeps it at its highest voltage.
@@ -271,22 +265,20 @@ impl CellState<'_> {
 
     /// Charging current (A) that keeps the cell at its highest voltage.
     fn held_a(&self, soc: f64, config: &OutlookConfig) -> f64 {
-        let max_v = config.max_voltage_v.unwrap_or(self.model.voltage_max_v);
-        (max_v - self.ocv_v(soc)) / self.ohm(soc, f64::INFINITY)
+        (self.max_v(config) - self.ocv_v(soc)) / self.ohm(soc, f64::INFINITY)
     }
 
     /// Energy (Wh) that the cell delivers with the charge `charge_ah` at this load.
-    fn delivered_wh(&self, charge_ah: f64, load: &Load) -> f64 {
-        let at = |part: f64| self.loaded_v(self.soc.mean - part * charge_ah / self.capacity.mean, load).0;
+    fn delivered_wh(&self, charge_ah: f64, load: &Load, config: &OutlookConfig) -> f64 {
+        let at = |part: f64| self.loaded_v(self.soc.mean - part * charge_ah / self.capacity.mean, load, config);
         charge_ah * mean_of(at)
     }
 
     /// Energy (Wh) that the cell takes up with the charge `charge_ah` at a constant current.
     fn taken_wh(&self, charge_ah: f64, current_a: f64, config: &OutlookConfig) -> f64 {
-        let max_v = config.max_voltage_v.unwrap_or(self.model.voltage_max_v);
         let at = |part: f64| {
             let soc = self.soc.mean + part * charge_ah / self.capacity.mean;
-            (self.ocv_v(soc) + current_a * self.ohm(soc, f64::INFINITY)).min(max_v)
+            (self.ocv_v(soc) + current_a * self.ohm(soc, f64::INFINITY)).min(self.max_v(config))
         };
         charge_ah * mean_of(at)
     }
@@ -313,33 +305,21 @@ impl CellState<'_> {
         (self.ocv_v(self.soc.mean - moved) - relaxing_v, self.ohm(self.soc.mean - 0.5 * moved, after_s))
     }
 
-    /// Largest current (A, positive) in a direction that keeps the cell within its limits for `for_s`, and the
-    /// standard deviation of this current.
-    fn limit_a(&self, direction: Direction, for_s: f64, config: &OutlookConfig) -> ScalarGaussian {
-        let per_soc_a = 3600.0 * self.capacity.mean / for_s;
+    /// Largest current (A, positive) in a direction that keeps the cell within its limits for `for_s`.
+    fn limit_a(&self, direction: Direction, for_s: f64, config: &OutlookConfig) -> f64 {
         let (sign, room, max_a, limit_v) = match direction {
-            Direction::Discharge => {
-                (1.0, self.soc.mean, config.max_discharge_a, config.min_voltage_v.unwrap_or(self.model.voltage_min_v))
-            }
-            Direction::Charge => {
-                let limit_v = config.max_voltage_v.unwrap_or(self.model.voltage_max_v);
-                (-1.0, 1.0 - self.soc.mean, config.max_charge_a, limit_v)
-            }
+            Direction::Discharge => (1.0, self.soc.mean, config.max_discharge_a, self.min_v(config)),
+            Direction::Charge => (-1.0, 1.0 - self.soc.mean, config.max_charge_a, self.max_v(config)),
         };
-        let most_a = max_a.unwrap_or(f64::INFINITY).min(per_soc_a * room.max(0.0));
-        let (mut current_a, mut ohm) = (0.0, 0.0);
-        for _ in 0..CURRENT_STEPS {
-            let (open_v, after_ohm) = self.response(sign * current_a, for_s);
-            current_a = (sign * (open_v - limit_v) / after_ohm).clamp(0.0, most_a);
-            ohm = after_ohm;
-        }
-        if current_a >= most_a {
-            let by_room_a = if max_a.is_some_and(|max_a| max_a <= most_a) { 0.0 } else { per_soc_a };
-            return ScalarGaussian { mean: most_a, variance: square(by_room_a) * self.soc.variance };
-        }
-        let slope_v = self.model.ocv_slope_v(&self.position(self.soc.mean), self.capacity.mean);
-        let variance = square(slope_v / ohm) * self.soc.variance + square(current_a) * self.log_resistance.variance;
-        ScalarGaussian { mean: current_a, variance }
+        let soc_per_a = for_s / (3600.0 * self.capacity.mean);
+        let most_a = max_a.unwrap_or(f64::INFINITY).min(room.max(0.0) / soc_per_a);
+        (0..CURRENT_STEPS).fold(0.0, |current_a, _| {
+            let (open_v, ohm) = self.response(sign * current_a, for_s);
+            let moved = self.position(self.soc.mean - sign * current_a * soc_per_a);
+            let slope_ohm = ohm + self.model.ocv_slope_v(&moved, self.capacity.mean) * soc_per_a;
+            let beyond_v = sign * (open_v - limit_v) - current_a * ohm;
+            (current_a + beyond_v / slope_ohm).clamp(0.0, most_a)
+        })
     }
 
     /// Voltage (V) after `after_s` of a current in a direction (A, positive).
@@ -350,23 +330,24 @@ impl CellState<'_> {
     }
 
     /// A value of the cell with its variance. `value` is computed again with each of SOC, capacity and ln resistance one
-    /// standard deviation higher and lower.
+    /// standard deviation higher and lower; the larger change counts, because a SOC of 0 or 1 changes to one side only.
     fn spread(&self, value: impl Fn(&Self) -> f64) -> ScalarGaussian {
-        let half = |change: fn(&mut Self, f64)| {
-            let [low, high] = [-1.0, 1.0].map(|sigmas| {
+        let mean = value(self);
+        let part = |change: fn(&mut Self, f64)| {
+            let changes = [-1.0, 1.0].map(|sigmas| {
                 let mut other = *self;
                 change(&mut other, sigmas);
-                value(&other)
+                square(value(&other) - mean)
             });
-            square(0.5 * (high - low))
+            changes[0].max(changes[1])
         };
-        let variance = half(|cell, sigmas| cell.soc.mean = (cell.soc.mean + sigmas * cell.soc.std()).clamp(0.0, 1.0))
-            + half(|cell, sigmas| {
+        let variance = part(|cell, sigmas| cell.soc.mean = (cell.soc.mean + sigmas * cell.soc.std()).clamp(0.0, 1.0))
+            + part(|cell, sigmas| {
                 let capacity_ah = cell.capacity.mean + sigmas * cell.capacity.std();
                 cell.capacity.mean = capacity_ah.max(0.1 * cell.capacity.mean);
             })
-            + half(|cell, sigmas| cell.log_resistance.mean += sigmas * cell.log_resistance.std());
-        ScalarGaussian { mean: value(self), variance }
+            + part(|cell, sigmas| cell.log_resistance.mean += sigmas * cell.log_resistance.std());
+        ScalarGaussian { mean, variance }
     }
 }
 
@@ -400,7 +381,7 @@ pub struct Outlook {
 /// Structure of the pack.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Structure {
-    /// Cells in series per [`CellState`]: 1, or the number of cells if only the pack's total voltage is measured.
+    /// Cells in series per [`CellNow`]: 1, or the number of cells if only the pack's total voltage is measured.
     pub series_per_state: f64,
     /// Parallel strings.
     pub strings: f64,
@@ -414,79 +395,86 @@ pub struct Structure {
 pub fn of_pack(
     config: &OutlookConfig,
     (load, mode): (&RecentLoad, Mode),
-    cells: &[CellState<'_>],
+    cells: &[CellNow<'_>],
     pack: &Structure,
 ) -> Option<Outlook> {
     let rated_ah = cells.first()?.model.rated_capacity_ah;
     let discharge = load.discharge.load();
     let drawn = discharge.unwrap_or(Load::usual(rated_ah));
-    let charger_a = load.charger_a(mode).unwrap_or(USUAL_LOAD_PER_H * rated_ah);
-    let least = |value: &dyn Fn(&CellState<'_>) -> f64| {
+    let charger = load.charger_a(mode);
+    let charger_a = charger.unwrap_or(USUAL_LOAD_PER_H * rated_ah);
+    // A weaker charger ends as soon as the voltage is reached.
+    let config = &OutlookConfig { taper_current_a: config.taper_current_a.min(charger_a), ..*config };
+    let least = |value: &dyn Fn(&CellNow<'_>) -> f64| {
         cells.iter().map(|cell| (value(cell), cell)).min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, cell)| cell)
     };
-    let weakest = least(&|cell| cell.soc.mean * cell.capacity.mean)?;
-    let fullest = least(&|cell| (1.0 - cell.soc.mean) * cell.capacity.mean)?;
-    let sum = |value: &dyn Fn(&CellState<'_>) -> f64| {
+    let weakest = least(&|cell| cell.dischargeable_ah(&drawn, config))?;
+    let fullest = least(&|cell| cell.chargeable_ah(config))?;
+    let sum = |value: &dyn Fn(&CellNow<'_>) -> f64| {
         pack.strings * pack.series_per_state * cells.iter().map(value).sum::<f64>()
     };
     // The errors of all cells count as equal, because they share the current sensor and the model.
-    let whole = |one: ScalarGaussian, value: &dyn Fn(&CellState<'_>) -> f64| ScalarGaussian {
+    let whole = |one: ScalarGaussian, value: &dyn Fn(&CellNow<'_>) -> f64| ScalarGaussian {
         mean: sum(value),
         variance: square(sum(&|_| 1.0)) * one.variance,
     };
-    let [drawn_ah, energy] = weakest.remaining(&drawn, config);
+    // A value at this load, with the error of the cell and of the future load.
+    let loaded = |load: Load, value: &dyn Fn(&CellNow<'_>, &Load) -> f64| {
+        let known = weakest.spread(|cell| value(cell, &load));
+        let changes = [-LOG_LOAD_STD, LOG_LOAD_STD].map(|log| value(weakest, &load.times(libm::exp(log))) - known.mean);
+        ScalarGaussian { variance: known.variance + square(changes[0]).max(square(changes[1])), ..known }
+    };
+    let drawn_ah = weakest.dischargeable_ah(&drawn, config);
+    let energy = loaded(drawn, &|cell, load| cell.delivered_wh(cell.dischargeable_ah(load, config), load, config));
+    let to_empty_s = discharge
+        .filter(|_| mode == Mode::Discharge)
+        .map(|load| loaded(load, &|cell, load| 3600.0 * cell.dischargeable_ah(load, config) / load.mean_a));
     let taken_ah = fullest.chargeable_ah(config);
     let to_full = fullest.spread(|cell| cell.taken_wh(cell.chargeable_ah(config), charger_a, config));
-    let to_empty_s = discharge.filter(|_| mode == Mode::Discharge).map(|load| {
-        let per_ah_s = 3600.0 / load.mean_a;
-        let variance = square(per_ah_s) * drawn_ah.variance + square(per_ah_s * drawn_ah.mean * LOG_LOAD_STD);
-        ScalarGaussian { mean: per_ah_s * drawn_ah.mean, variance }
-    });
     let target_soc = fullest.soc.mean + (config.target_soc - pack.soc) * pack.capacity_ah / fullest.capacity.mean;
-    let charging = |charge_ah: &dyn Fn(&CellState<'_>) -> f64| {
+    let target_ah = |cell: &CellNow<'_>| ((target_soc - cell.soc.mean) * cell.capacity.mean).max(0.0);
+    let charging = |charge_ah: &dyn Fn(&CellNow<'_>) -> f64| {
         let time_s = fullest.spread(|cell| cell.charging_s(charge_ah(cell), charger_a, config));
         let held_s = time_s.mean - 3600.0 * charge_ah(fullest) / charger_a;
         let variance = time_s.variance + square(LOG_HELD_STD * held_s);
-        load.charger_a(mode).map(|_| ScalarGaussian { variance, ..time_s })
+        charger.map(|_| ScalarGaussian { variance, ..time_s })
     };
     let powers = |direction| {
-        let limits = cells.iter().map(|cell| cell.limit_a(direction, POWER_S[1], config).mean).enumerate();
-        let (index, _) = limits.min_by(|a, b| a.1.total_cmp(&b.1))?;
-        let powers = POWER_S.map(|for_s| {
-            let limit = cells[index].limit_a(direction, for_s, config);
-            let voltage_v = sum(&|cell| cell.voltage_after(direction, limit.mean, for_s));
-            ScalarGaussian { mean: limit.mean * voltage_v, variance: square(voltage_v) * limit.variance }
+        let [short, middle, long] = POWER_S.map(|for_s| {
+            let limits = cells.iter().map(|cell| cell.limit_a(direction, for_s, config)).enumerate();
+            let (index, limit_a) = limits.min_by(|a, b| a.1.total_cmp(&b.1))?;
+            let power_w = |cell: &CellNow<'_>, limit_a: f64| limit_a * cell.voltage_after(direction, limit_a, for_s);
+            let one = cells[index].spread(|cell| power_w(cell, cell.limit_a(direction, for_s, config)));
+            Some((whole(one, &|cell| power_w(cell, limit_a)), index))
         });
-        Some((powers, CellIndex(u16::try_from(index).unwrap_or(u16::MAX))))
+        let limiting = CellIndex(u16::try_from(middle?.1).unwrap_or(u16::MAX));
+        Some(([short?.0, middle?.0, long?.0], limiting))
     };
     let (discharge, charge) = (powers(Direction::Discharge)?, powers(Direction::Charge)?);
     Some(Outlook {
-        remaining_wh: whole(energy, &|cell| cell.delivered_wh(drawn_ah.mean, &drawn)),
+        remaining_wh: whole(energy, &|cell| cell.delivered_wh(drawn_ah, &drawn, config)),
         to_full_wh: whole(to_full, &|cell| cell.taken_wh(taken_ah, charger_a, config)),
         to_empty_s,
         to_full_s: charging(&|cell| cell.chargeable_ah(config)),
-        to_target_s: charging(&|cell| {
-            let charge_ah = (target_soc - cell.soc.mean) * cell.capacity.mean;
-            charge_ah.clamp(0.0, cell.chargeable_ah(config))
-        }),
+        to_target_s: charging(&target_ah).filter(|_| target_ah(fullest) <= taken_ah),
         discharge_w: discharge.0,
         charge_w: charge.0,
         limiting_cells: [discharge.1, charge.1],
     })
 }
 
-/// Energy of the full cell relative to a new cell of the rated capacity, both discharged in five hours.
-pub fn energy_health(config: &OutlookConfig, cell: &CellState<'_>) -> ScalarGaussian {
+/// Energy of the full cell relative to a new cell of the rated capacity, both discharged at C/2 and 25 degrees C.
+pub fn energy_health(config: &OutlookConfig, cell: &CellNow<'_>) -> ScalarGaussian {
     let load = Load::constant(USUAL_LOAD_PER_H * cell.model.rated_capacity_ah);
     let exact = |mean: f64| ScalarGaussian { mean, variance: 0.0 };
-    let energy_wh = |cell: &CellState<'_>| {
-        let full = CellState { soc: exact(1.0), ..*cell };
-        full.delivered_wh(full.dischargeable_ah(&load, config), &load)
+    let energy_wh = |cell: &CellNow<'_>| {
+        let full = CellNow { soc: exact(1.0), ..*cell };
+        full.delivered_wh(full.dischargeable_ah(&load, config), &load, config)
     };
-    let model = cell.model;
-    let new = CellState { capacity: exact(model.capacity_ah), log_resistance: exact(0.0), slow_ratio: 1.0, ..*cell };
+    let (model, cell) = (cell.model, &CellNow { temperature_c: CURVE_C, ..*cell });
+    let new = CellNow { capacity: exact(model.capacity_ah), log_resistance: exact(0.0), slow_ratio: 1.0, ..*cell };
     let new_wh = energy_wh(&new) * model.rated_capacity_ah / model.capacity_ah;
-    let aged = CellState { soc: exact(1.0), ..*cell }.spread(energy_wh);
+    let aged = CellNow { soc: exact(1.0), ..*cell }.spread(energy_wh);
     ScalarGaussian { mean: aged.mean / new_wh, variance: aged.variance / square(new_wh) }
 }
 

@@ -12,7 +12,7 @@ use crate::can::j1939::{Lamp, Node, NodeConfig, TroubleCode};
 use crate::can::poll::PollConfig;
 use crate::can::secoc::Authentication;
 use crate::can::uds::{self, Answer};
-use crate::cell::{CellModel, CellModule, EstimatorConfig, Label};
+use crate::cell::{CellModel, CellModule, EstimatorConfig, FleetPrior, Label};
 use crate::cell_faults::BalancingConfig;
 use crate::health::{CapacityMethod, HealthConfig};
 use crate::quantity::{BusIndex, CellIndex};
@@ -49,6 +49,8 @@ pub struct MonitorConfig {
     pub modules: Vec<CellModule>,
     /// Label of the cells, the starting point for learning their model; `None` = the model comes from a model file.
     pub label: Option<Label>,
+    /// What other vehicles have learned about cells of this label.
+    pub fleet: Option<FleetPrior>,
     /// Whether the BMS discharges fuller cells after a charge (passive balancing).
     pub is_balanced: bool,
     /// Meaning of the balancing bits in `input`; `None` = `input` has no balancing bits.
@@ -101,6 +103,8 @@ pub struct OutputConfig {
     pub alarm_period_s: f64,
     /// Period of the digest (all its pages) (s).
     pub digest_period_s: f64,
+    /// Whether cyclic frames are sent while the buses sleep. They would keep other nodes awake.
+    pub while_asleep: bool,
 }
 
 /// Configuration of the J1939 node.

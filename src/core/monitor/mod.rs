@@ -53,8 +53,9 @@ pub use snapshot::{RestoreError, Snapshot};
 pub use stage::intake::ControllerCount;
 pub use stage::intake::command_gate::CommandCounts;
 pub use stage::learning::Throughput;
+pub use stage::learning::moved::MovedSums;
 pub use stage::modelling::{ModelChange, ModelView};
-pub use stage::sending::MAX_TEST_S;
+pub use stage::sending::{MAX_TEST_S, RESTART_FRESHNESS};
 pub use stage::statistics::{AlarmCounts, BusStatistics, LearningCounts, Statistics, VoltageCounts};
 
 /// The pure core of packwatch: takes records and returns outputs.
@@ -248,6 +249,7 @@ impl Monitor {
                     stages.sampling.has_second_sender = intake.second_senders().next().is_some();
                     stages.run_housekeeping(now, intake.bus_fault(now, config.interfaces), silence, out);
                 }
+                stages.sending.set_asleep(now, stages.sleep.since.is_some());
                 if stages.sending.take_freshness_due(now) {
                     let freshness = intake.command_gate.announce(now);
                     stages.sending.send_freshness(now, config.commands.as_ref().map(|of| of.bus), freshness, out);
@@ -275,6 +277,12 @@ impl Monitor {
             | RecordKind::Reload
             | RecordKind::Restore { .. } => {}
         }
+    }
+
+    /// Freshness of the last authenticated frame. The driver must store the state before this number has risen by
+    /// [`RESTART_FRESHNESS`] since the last stored state.
+    pub fn sent_freshness(&self) -> u64 {
+        self.stages.sending.sent_freshness()
     }
 
     /// How to check the authenticator of a frame; `None` if the frame does not belong to an authenticated message. The

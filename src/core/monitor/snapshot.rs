@@ -118,11 +118,13 @@ impl Snapshot {
         restarted.intake.restart();
         restarted.sampling.restart();
         restarted.estimation.is_current_doubtful = false;
+        restarted.learning.load.interrupt();
+        restarted.learning.moved = restarted.learning.moved.interrupted();
         restarted.estimation.current_check.interrupt();
         restarted.modelling.iter_mut().for_each(ModellingState::restart);
         restarted.diagnosis.iter_mut().for_each(CellFaultDetector::interrupt);
         restarted.alarming.restart();
-        restarted.sending.restart();
+        restarted.sending.restart(restarted.time);
         restarted.packs.drop_aside();
         restarted
     }
@@ -241,7 +243,7 @@ impl Snapshot {
         self.learning.rebase(by_nanos);
         self.diagnosis.iter_mut().for_each(|diagnosis| diagnosis.rebase(by_nanos));
         self.alarming.alarms.rebase(by_nanos);
-        self.sending.schedule.rebase(by_nanos);
+        self.sending.rebase(by_nanos);
         self.intake.buses.rebase(by_nanos);
         self.intake.commands.rebase(by_nanos);
         self.asleep_since = self.asleep_since.map(|since| since.plus_nanos(by_nanos));

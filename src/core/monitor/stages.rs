@@ -227,6 +227,7 @@ impl Stages {
         let rest_a = config.transition.dead_band_a / strings;
         let mode = state.detector.mode();
         state.load.observe(now, mode, current_a.map(|pack_a| pack_a / strings), rest_a);
+        state.moved.observe(now, current_a, || self.sampling.pack_voltage_v(self.estimation.cell_indices(), now));
         if observed.change.is_none() && !observed.candidate_begins {
             return;
         }
@@ -372,6 +373,7 @@ impl Stages {
         self.sending.poll_with(now, out, |poller, _| poller.restart());
         self.publisher(now, out).apply(AlarmInput::Gap);
         self.learning.state.recharge.interrupt();
+        self.learning.state.load.interrupt();
         self.estimation.bank.change_all(|_, cell| cell.note_sleep());
         self.forget_pack_state();
     }
@@ -532,6 +534,7 @@ impl Stages {
         let seconds = Some(now.since(since));
         out.events.push(Event { time: now, kind: EventKind::BusAsleep { asleep: false, seconds } });
         self.sampling.sampler.wake(now);
+        self.sending.restart(now);
     }
 
     /// Whether a reading of this channel ends a bus sleep. A reading of the supply voltage does not, because the

@@ -21,7 +21,7 @@ use crate::health::outlook::Outlook;
 use crate::health::{InsufficientData, PackState, RemainingLife};
 use crate::quantity::catalogue::{CellValues, Estimate, PackValues, Quantity, RECORDED, Values};
 use crate::quantity::{BusIndex, CellIndex, Channel, Mode, Timestamp};
-use crate::sample::{ReadingCounts, VoltageSource};
+use crate::sample::ReadingCounts;
 
 /// Half the width of the 95 % interval, in standard deviations.
 const Z95: f64 = 1.96;
@@ -255,15 +255,6 @@ impl Monitor {
         }
     }
 
-    /// Sum of the cells' voltages (V); `None` unless all cell voltages are fresh.
-    fn pack_voltage_v(&self) -> Option<f64> {
-        let sum_v: Option<f64> = self.cell_views().map(|view| view.values.mean(Quantity::Voltage)).sum();
-        match self.stages.sampling.sampler.config().voltage_source {
-            VoltageSource::Cells => sum_v,
-            VoltageSource::PackTotal { series } => sum_v.map(|cell_v| cell_v * f64::from(series)),
-        }
-    }
-
     /// Present values of the pack.
     pub fn pack_view(&self) -> PackView {
         let Stages { sampling, estimation, learning, .. } = &self.stages;
@@ -287,7 +278,7 @@ impl Monitor {
         values.set(Quantity::SocLow, edge(-1.0));
         values.set(Quantity::SocHigh, edge(1.0));
         values.set(Quantity::ReportedSoc, sampler.reported(Channel::ReportedSoc, now));
-        values.set(Quantity::Voltage, self.pack_voltage_v());
+        values.set(Quantity::Voltage, sampling.pack_voltage_v(estimation.cell_indices(), now));
         values.set(Quantity::Current, sampler.pack_current_a(now));
         values.set(Quantity::CurrentOffset, self.current_offset());
         values.set(Quantity::TemperatureMax, hottest.and_then(|(hottest_c, is_whole)| is_whole.then_some(hottest_c)));
@@ -311,6 +302,7 @@ impl Monitor {
             shortest_lived_cell: life.map(|(cell, _)| cell),
             model_state: Some(model.state),
             model_fits_better: model.chemistry,
+            moved: Some(learning.state.moved.sums),
             values,
         }
     }

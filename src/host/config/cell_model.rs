@@ -21,7 +21,7 @@ mod source;
 mod write;
 
 pub(crate) use keys::SECTIONS;
-pub use label::{of_label, of_view};
+pub use label::{of_fleet, of_label, of_view};
 pub(crate) use read::load_with;
 pub use read::{load, load_sourced};
 pub use source::{KnownBy, LearnedFrom, MeasuredRange, ModelSource, SourcedModel, state_words};

@@ -326,7 +326,7 @@ fn faults_of_all_files_are_sorted_by_line() {
     let all = read_texts(&pack, &cell, "VERSION \"\"\nBO_ 4000 Cells: 8 A\n").unwrap_err();
     let expected = [
         "pack.toml:2: pack.cells = 0, must be 1 to 1024",
-        "pack.toml:3: pack.x is not a known key, must be one of cells, strings, cell_model, chemistry, learn_model, balancing, \
+        "pack.toml:3: pack.x is not a known key, must be one of cells, strings, cell_model, chemistry, prior, learn_model, balancing, \
          voltage_min_v, voltage_max_v, rated_capacity_ah, initial_capacity_ah, initial_capacity_std_ah, ambient_c, module",
         "pack.toml:11: input.current.positive = \"in\", must be charge or discharge",
         "pack.toml:17: recharge.to_soc = 0.1, must be above recharge.from_soc = 0.3",

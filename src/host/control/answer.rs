@@ -1,5 +1,7 @@
 //! Computes answers to requests from the current alarms. All functions are pure.
 
+use std::cmp::Reverse;
+
 use super::MAX_LISTED;
 use super::protocol::{AlarmList, Answer, CommandOutcome, UnknownAlarms};
 use crate::alarm::{Alarm, AlarmEngine, AlarmState, Selector};
@@ -33,11 +35,11 @@ fn needs_attention(alarm: &Alarm) -> bool {
     }
 }
 
-/// Keeps as many alarms as fit into an answer, raised alarms first. Returns the number of omitted alarms.
+/// Keeps as many alarms as fit into an answer, raised and severe alarms first. Returns the number of omitted alarms.
 fn shorten(alarms: &mut Vec<Alarm>) -> usize {
     let omitted = alarms.len().saturating_sub(MAX_LISTED);
     if omitted > 0 {
-        alarms.sort_by_key(|alarm| !alarm.state.is_raised());
+        alarms.sort_by_key(|alarm| (!alarm.state.is_raised(), Reverse(alarm.severity)));
         alarms.truncate(MAX_LISTED);
     }
     omitted

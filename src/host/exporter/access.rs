@@ -1,16 +1,15 @@
-//! Decides who may read: everyone on this computer, or those who know the token.
+//! Decides who may read: everyone on this computer, or whoever knows the token.
 //!
 //! | address | without a token | with a token |
 //! | --- | --- | --- |
-//! | of this computer | everything | everything, with the token |
-//! | of a network | metrics only | everything, with the token |
+//! | loopback | everything | everything, with the token |
+//! | any other | metrics only | everything, with the token |
 //!
 //! A client sends the token as `Authorization: Bearer TOKEN`, or once as `?token=TOKEN`. In the second case the answer
 //! sets a cookie and redirects to the address without the token, so that the token does not stay in the browser's
 //! history. The liveness check needs no token.
 //!
-//! Without a token, the page must be requested by a numeric address or as `localhost`. Otherwise a foreign page in a
-//! browser on this computer could read it under a name that it lets point to this computer (DNS rebinding).
+//! Without a token, the request must name this computer ([`names_this_computer`]).
 
 use std::fs;
 use std::hint::black_box;
@@ -18,7 +17,9 @@ use std::net::IpAddr;
 use std::path::Path;
 
 use hyper::Request;
-use hyper::header::{AUTHORIZATION, COOKIE, HOST};
+use hyper::header::{AUTHORIZATION, COOKIE};
+
+use crate::http::names_this_computer;
 
 /// Fewest characters of a token. 16 hexadecimal digits are 64 bits.
 const MIN_TOKEN: usize = 16;
@@ -63,28 +64,23 @@ impl Access {
         let path = request.uri().path();
         let header = |name| request.headers().get_all(name).iter().filter_map(|value| value.to_str().ok());
         let Some(token) = self.token.as_deref().filter(|_| path != "/-/healthy") else {
-            let is_local = self.is_local && header(HOST).all(is_numeric);
+            let is_local = self.is_local && names_this_computer(request);
             let is_open = is_local || matches!(path, "/metrics" | "/-/healthy");
             return if is_open { Decision::Allowed } else { Decision::OnlyLocal };
         };
         let query = request.uri().query().unwrap_or_default();
         if query.split('&').filter_map(|pair| pair.strip_prefix("token=")).any(|given| is_equal(given, token)) {
-            return Decision::SetCookie(format!("{COOKIE_NAME}={token}; Path=/; HttpOnly; SameSite=Lax"));
+            return Decision::SetCookie(format!(
+                "{COOKIE_NAME}={token}; Path=/; Max-Age=31536000; HttpOnly; SameSite=Lax"
+            ));
         }
         let bearer = header(AUTHORIZATION).filter_map(|value| value.split_once(' '));
         let mut bearer = bearer.filter(|(scheme, _)| scheme.eq_ignore_ascii_case("bearer")).map(|(_, given)| given);
-        let cookies = header(COOKIE).flat_map(|value| value.split("; ").filter_map(|pair| pair.split_once('=')));
+        let cookies = header(COOKIE).flat_map(|value| value.split(';').filter_map(|pair| pair.trim().split_once('=')));
         let mut cookies = cookies.filter(|(name, _)| *name == COOKIE_NAME).map(|(_, given)| given);
         let is_known = bearer.any(|given| is_equal(given, token)) || cookies.any(|given| is_equal(given, token));
         if is_known { Decision::Allowed } else { Decision::NeedsToken }
     }
-}
-
-/// Whether a host with an optional port is a numeric address or `localhost`.
-fn is_numeric(host: &str) -> bool {
-    let name = host.rsplit_once(':').filter(|(_, port)| port.bytes().all(|byte| byte.is_ascii_digit()));
-    let name = name.map_or(host, |(name, _)| name);
-    name == "localhost" || name.trim_matches(['[', ']']).parse::<IpAddr>().is_ok()
 }
 
 /// Compares in a time that does not depend on the position of the first difference.

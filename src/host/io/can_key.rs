@@ -7,7 +7,6 @@
 
 use std::ffi::OsString;
 use std::fmt;
-use std::fs::File;
 use std::io::Read;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
@@ -15,6 +14,7 @@ use std::path::{Path, PathBuf};
 use aes::Aes128;
 use cmac::{Cmac, KeyInit, Mac as _};
 
+use crate::bounded_file;
 use crate::can::secoc::Mac;
 use crate::config::KeySource;
 
@@ -42,26 +42,32 @@ impl CanKey {
                 let folder = credentials.map(PathBuf::from).ok_or_else(|| {
                     format!("key of [authentication]: credential {name} cannot be read: $CREDENTIALS_DIRECTORY is not set; start the daemon with LoadCredential={name}:PATH")
                 })?;
-                Self::read(&folder.join(name), false)
+                Self::read(&folder.join(name), None)
             }
-            KeySource::File(path) => Self::read(path, true),
+            KeySource::File(path) => Self::read(path, Some(nix::unistd::geteuid().as_raw())),
         }
     }
 
-    fn read(path: &Path, is_private: bool) -> Result<Self, String> {
+    /// Reads a file. `user`: the user of the daemon; he or root must own the file, which nobody else may read. `None` =
+    /// the service manager protects the file.
+    pub fn read(path: &Path, user: Option<u32>) -> Result<Self, String> {
         let error = |why: String| format!("key of [authentication]: {}: {why}", path.display());
         let unreadable = |why: std::io::Error| {
             error(format!("cannot be read: {why}, must be a file of {KEY_BYTES} bytes or {} hex digits", 2 * KEY_BYTES))
         };
-        // This check comes before the file is opened, because opening a named pipe would wait for a writer.
-        if path.metadata().is_ok_and(|found| !found.is_file()) {
-            return Err(error("is not a regular file".to_owned()));
-        }
-        let file = File::open(path).map_err(unreadable)?;
-        let mode = file.metadata().map_err(|why| error(why.to_string()))?.mode() & 0o7777;
-        // The mask 0o077 selects the permissions of the group and of all other users.
-        if is_private && mode & 0o077 != 0 {
-            return Err(error(format!("mode {mode:04o}, must be 0600 or 0400: no other user may read it")));
+        let file = bounded_file::open(path).map_err(unreadable)?;
+        if let Some(user) = user {
+            let found = file.metadata().map_err(|why| error(why.to_string()))?;
+            let (owner, mode) = (found.uid(), found.mode() & 0o7777);
+            if owner != 0 && owner != user {
+                return Err(error(format!(
+                    "belongs to user {owner}, must belong to root or to the daemon's user {user}"
+                )));
+            }
+            // The mask 0o077 selects the permissions of the group and of all other users.
+            if mode & 0o077 != 0 {
+                return Err(error(format!("mode {mode:04o}, must be 0600 or 0400: no other user may read it")));
+            }
         }
         let mut content = Vec::new();
         // Reads one byte more than the longest key (hex digits and a line break), to detect longer files.
@@ -75,11 +81,16 @@ impl CanKey {
     /// Fails if the content has neither form, or if all bytes are equal.
     pub fn parse(content: &[u8]) -> Result<Self, String> {
         let found = content.len();
+        let digits = content.trim_ascii_end();
+        if digits.len() == KEY_BYTES && digits.iter().all(u8::is_ascii_hexdigit) {
+            return Err(format!(
+                "{KEY_BYTES} hex digits are {} bytes, must be {KEY_BYTES} bytes or {} hex digits",
+                KEY_BYTES / 2,
+                2 * KEY_BYTES
+            ));
+        }
         let neither = || format!("{found} bytes, must be {KEY_BYTES} bytes or {} hex digits", 2 * KEY_BYTES);
-        let key = <[u8; KEY_BYTES]>::try_from(content)
-            .ok()
-            .or_else(|| hex_key(content.trim_ascii_end()))
-            .ok_or_else(neither)?;
+        let key = <[u8; KEY_BYTES]>::try_from(content).ok().or_else(|| hex_key(digits)).ok_or_else(neither)?;
         if key.iter().all(|byte| *byte == key[0]) {
             return Err("all bytes of the key are equal, must be random".to_owned());
         }
@@ -149,6 +160,12 @@ mod tests {
             let error = CanKey::parse(bad).unwrap_err();
             assert_eq!(error, format!("{} bytes, must be 16 bytes or 32 hex digits", bad.len()));
         }
+        for short in [&b"2b7e151628aed2a6"[..], b"2b7e151628aed2a6\n"] {
+            assert_eq!(
+                CanKey::parse(short).unwrap_err(),
+                "16 hex digits are 8 bytes, must be 16 bytes or 32 hex digits"
+            );
+        }
         assert_eq!(CanKey::parse(&[b'0'; 32]).unwrap_err(), "all bytes of the key are equal, must be random");
         assert_eq!(format!("{:?}", CanKey::parse(KEY).unwrap()), "CanKey(hidden)");
     }
@@ -163,7 +180,7 @@ mod tests {
         };
         assert!(error(&source, None).contains("can.key: cannot be read: No such file or directory"));
         std::fs::create_dir(&path).unwrap();
-        assert!(error(&source, None).ends_with("can.key: is not a regular file"));
+        assert!(error(&source, None).contains("can.key: cannot be read: is not a regular file"));
         std::fs::remove_dir(&path).unwrap();
         std::fs::write(&path, KEY).unwrap();
         for (mode, is_good) in [(0o600, true), (0o400, true), (0o640, false), (0o604, false), (0o620, false)] {
@@ -171,6 +188,16 @@ mod tests {
             assert_eq!(CanKey::load(&source, None).is_ok(), is_good, "{mode:o}");
         }
         assert!(error(&source, None).ends_with("can.key: mode 0620, must be 0600 or 0400: no other user may read it"));
+        std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o600)).unwrap();
+        let owner = path.metadata().unwrap().uid();
+        assert!(CanKey::read(&path, Some(owner)).is_ok());
+        if std::os::unix::fs::chown(&path, Some(1234), None).is_ok() {
+            assert!(error(&source, None).contains("can.key: belongs to user 1234, must belong to root"));
+            assert!(CanKey::read(&path, Some(1234)).is_ok());
+        }
+        let pipe = folder.path().join("pipe");
+        assert!(std::process::Command::new("mkfifo").args(["-m", "600"]).arg(&pipe).status().unwrap().success());
+        assert!(error(&KeySource::File(pipe), None).contains("is not a regular file"));
         let credential = KeySource::Credential("can.key".to_owned());
         assert!(error(&credential, None).contains("$CREDENTIALS_DIRECTORY is not set"));
         assert!(

@@ -40,7 +40,7 @@ struct Slot<K> {
 
 /// Time at which the connection became idle; `None` = its request is being processed.
 #[derive(Debug, Clone)]
-pub(crate) struct Activity(Arc<Mutex<Option<Instant>>>);
+pub struct Activity(Arc<Mutex<Option<Instant>>>);
 
 impl Activity {
     /// The activity of a new connection, which is idle.

@@ -18,6 +18,12 @@ use read_ahead::ReadAhead;
 /// bytes.
 const BLOCK: usize = 256 * 1024;
 
+/// Largest expansion of a compressed log. The logs of parked vehicles expand less than a hundred times, because each line
+/// has its own time. zstd stores zeros in a 30,000th of their size.
+const MAX_EXPANSION: u64 = 1000;
+/// Smaller compressed files may expand as much as a file of this size, bytes.
+const MIN_PACKED: u64 = 4096;
+
 /// One line without its line feed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RawLine<'a> {
@@ -50,14 +56,41 @@ pub(super) fn open_parts(paths: &[PathBuf], read_bytes: &Arc<AtomicU64>) -> io::
     let mut magic = Vec::with_capacity(4);
     (&mut counted).take(4).read_to_end(&mut magic)?;
     let (gzip, zstd) = (magic.starts_with(&[0x1F, 0x8B]), magic == [0x28, 0xB5, 0x2F, 0xFD]);
-    let whole = Cursor::new(magic).chain(counted);
-    if gzip {
-        let packed = io::BufReader::with_capacity(BLOCK, whole);
-        Ok(Box::new(ReadAhead::new(flate2::bufread::MultiGzDecoder::new(packed), BLOCK)?))
+    let packed = Arc::<AtomicU64>::default();
+    let whole = CountingReader { inner: Box::new(Cursor::new(magic).chain(counted)), bytes: Arc::clone(&packed) };
+    let decoder: Box<dyn Read + Send> = if gzip {
+        Box::new(flate2::bufread::MultiGzDecoder::new(io::BufReader::with_capacity(BLOCK, whole)))
     } else if zstd {
-        Ok(Box::new(ReadAhead::new(zstd::stream::read::Decoder::new(whole)?, BLOCK)?))
+        Box::new(zstd::stream::read::Decoder::new(whole)?)
     } else {
-        Ok(Box::new(whole))
+        return Ok(Box::new(whole));
+    };
+    Ok(Box::new(ReadAhead::new(ExpansionLimit { decoder, packed, expanded: 0 }, BLOCK)?))
+}
+
+/// Ends a compressed file that expands far more than a log can, because a few bytes would otherwise occupy the reader
+/// for minutes.
+struct ExpansionLimit {
+    decoder: Box<dyn Read + Send>,
+    /// Bytes read from the compressed file.
+    packed: Arc<AtomicU64>,
+    /// Bytes that the decoder has returned.
+    expanded: u64,
+}
+
+impl Read for ExpansionLimit {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        let count = self.decoder.read(buffer)?;
+        self.expanded += count as u64;
+        let packed = self.packed.load(Ordering::Relaxed);
+        if self.expanded > MAX_EXPANSION * packed.max(MIN_PACKED) {
+            let what = format!(
+                "{packed} bytes expand to more than {} bytes, must be a log: at most {MAX_EXPANSION} times",
+                self.expanded
+            );
+            return Err(io::Error::new(io::ErrorKind::InvalidData, what));
+        }
+        Ok(count)
     }
 }
 
@@ -236,6 +269,29 @@ mod tests {
         let mut text = vec![b'x'; 3 * BLOCK + 5];
         text.extend(b"\nshort\n");
         assert_eq!(all(&text), [(usize::MAX, false), (5, true)]);
+    }
+
+    #[test]
+    fn endless_expansion_ends_with_error() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("bomb.log.zst");
+        for (line, is_log) in [("\n", false), ("(1.000000) can0 123#00\n", false), ("", true)] {
+            let text = match is_log {
+                true => (0..400_000).map(|n| format!("({n}.000000) can0 123#00\n")).collect(),
+                false => line.repeat((32 << 20) / line.len()),
+            };
+            std::fs::write(&path, zstd::bulk::compress(text.as_bytes(), 1).expect("compressed")).expect("written");
+            let mut lines = Lines::new(open(&path, &Arc::default()).expect("opened"));
+            let error = loop {
+                match lines.next_line() {
+                    Ok(Some(_)) => {}
+                    Ok(None) => break None,
+                    Err(error) => break Some(error.to_string()),
+                }
+            };
+            assert_eq!(error.is_none(), is_log, "{error:?}");
+            assert!(is_log || lines.number() < 20_000_000, "{}", lines.number());
+        }
     }
 
     #[test]

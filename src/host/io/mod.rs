@@ -4,7 +4,7 @@ pub mod background_file;
 pub mod can_key;
 pub mod candump;
 pub mod clock;
-pub(crate) mod connection_slots;
+pub mod connection_slots;
 pub mod csv_log;
 pub mod event_log;
 pub mod journal;

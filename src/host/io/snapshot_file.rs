@@ -3,6 +3,7 @@
 use std::io::{self, Write};
 use std::path::Path;
 
+use crate::bounded_file;
 use crate::io::json::json_fault;
 use crate::io::result_file::ResultFile;
 use crate::monitor::Snapshot;
@@ -24,7 +25,7 @@ pub fn write(path: &Path, snapshot: &Snapshot) -> io::Result<()> {
 /// Fails if the file cannot be read or is not a snapshot. The message names the file and the reason, and the line if
 /// the content is invalid.
 pub fn read(path: &Path) -> Result<Snapshot, String> {
-    let bytes = std::fs::read(path).map_err(|error| format!("{}: cannot be read: {error}", path.display()))?;
+    let bytes = bounded_file::read(path).map_err(|error| format!("{}: cannot be read: {error}", path.display()))?;
     serde_json::from_slice(&bytes).map_err(|error| {
         let (path, line, fault) = (path.display(), error.line(), json_fault(&error));
         format!("{path}:{line}: not a snapshot, must be a file written with --snapshot: {fault}")

@@ -201,6 +201,7 @@ impl Engine {
     pub(super) fn handle_store_progress(&mut self, progress: StoreProgress, time: Timestamp) {
         self.barrier.release(progress.ticket, |transmit| send(&self.links, self.key.as_ref(), transmit));
         (self.store_works, self.has_room) = (progress.works, progress.has_room);
+        self.has_lost_file |= progress.was_replaced;
         self.progress = Some(progress);
         self.report_store_health(time);
     }
@@ -217,7 +218,7 @@ impl Engine {
         let is_tried = self.progress.is_some() || self.late > 0 || self.store.is_none();
         Some(StoreStatus {
             path,
-            works: is_tried.then_some(self.store_works),
+            works: is_tried.then_some(self.store_works && !progress.was_replaced),
             commits: progress.commits,
             failures: progress.failures,
             late: self.late,
@@ -254,6 +255,15 @@ impl Engine {
         if self.reported_works != Some(works) {
             self.reported_works = Some(works);
             self.handle(&Record::store(time, works));
+        }
+    }
+
+    /// If frames are authenticated, stores the state of the start. The caller sends no frame before.
+    pub(super) fn store_start(&mut self, time: Timestamp) {
+        if self.key.is_some()
+            && let Some(store) = &mut self.store
+        {
+            store.write_start(&self.monitor, time);
         }
     }
 

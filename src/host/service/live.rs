@@ -20,13 +20,23 @@ use crate::io::clock::{MappedClock, Reading, StepDetector};
 use crate::io::snapshot_file;
 use crate::io::stop::Stop;
 use crate::logging;
-use crate::monitor::{Command, Record, TICK_PERIOD_MS};
+use crate::monitor::{Command, MERGE_TOLERANCE_NS, Record, TICK_PERIOD_MS};
 use crate::quantity::Timestamp;
 use crate::store::StoreProgress;
 
 /// Maximum number of records handled between two checks of the timer. A full bus delivers fewer records during one
 /// tick.
 const BATCH: usize = 256;
+/// If the loop has not run for longer than this time, its process was stopped (SIGSTOP, a debugger, a computer without
+/// time for it). The sockets then hold frames of a long time, which must be merged before they are handled. The time is
+/// the largest step back that the core accepts from frames merged out of order.
+const MAX_PAUSE_NS: i64 = MERGE_TOLERANCE_NS;
+/// Pause between two attempts to collect these frames, and maximum number of attempts. Nothing is collected after an attempt
+/// that found only frames received after the stop.
+const MERGE_ROUND: Duration = Duration::from_millis(10);
+const MERGE_ROUNDS: usize = 100;
+/// Maximum number of records that are merged after a stop. All sockets together hold fewer.
+const MAX_MERGED: usize = 1 << 20;
 /// Time for the interfaces to send queued frames when the daemon stops.
 const DRAIN_LIMIT: Duration = Duration::from_millis(500);
 
@@ -41,6 +51,8 @@ pub(super) struct ServiceLoop {
     pub(super) clock: MappedClock,
     pub(super) clock_steps: StepDetector,
     pub(super) batch: Vec<Record>,
+    /// Time of the latest tick.
+    pub(super) ticked: Timestamp,
     pub(super) left_out_reported: Instant,
     pub(super) status_publisher: StatusPublisher,
     /// The running fit of the cell model, on another thread.
@@ -91,7 +103,10 @@ impl ServiceLoop {
                 // At most one configuration a second is read.
                 step = self.reload.next() => self.handle_reload(step).await,
                 received = self.inbox.recv_many(&mut self.batch, BATCH) => {
-                    if received > 0 { self.handle_batch() }
+                    if received > 0 {
+                        self.merge_after_stop().await;
+                        self.handle_batch();
+                    }
                 }
             }
         }
@@ -142,8 +157,10 @@ impl ServiceLoop {
 
     /// Handles the input that was received before the tick, then the tick. Returns the time of the tick.
     async fn tick(&mut self) -> Timestamp {
+        self.merge_after_stop().await;
         self.drain().await;
         let time = self.clock.now();
+        self.ticked = time;
         self.engine.poll_store(time);
         self.engine.handle(&Record::tick(time));
         time
@@ -178,6 +195,29 @@ impl ServiceLoop {
         let ticket = self.engine.handle(&Record::command(time, command));
         let Engine { monitor, outputs, .. } = &self.engine;
         (answer::outcome(monitor.alarms(), &command, &outputs.events, time), ticket)
+    }
+
+    /// If the process was stopped, collects everything that has arrived on all interfaces since then, so that the core
+    /// receives these frames in order of time and before the present tick. Otherwise time would go backwards.
+    async fn merge_after_stop(&mut self) {
+        if self.clock.now().nanos() - self.ticked.nanos() <= MAX_PAUSE_NS {
+            return;
+        }
+        let resumed = self.clock.now();
+        self.ticked = resumed;
+        for _ in 0..MERGE_ROUNDS {
+            // The tasks of the interfaces read their sockets here. Each of them has run before the pause ends.
+            tokio::time::sleep(MERGE_ROUND).await;
+            let before = self.batch.len();
+            while self.batch.len() < MAX_MERGED
+                && let Ok(received) = self.inbox.try_recv()
+            {
+                self.batch.push(received);
+            }
+            if self.batch[before..].iter().all(|record| record.time >= resumed) {
+                return;
+            }
+        }
     }
 
     /// Handles everything that the interfaces have already received.

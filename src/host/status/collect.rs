@@ -3,6 +3,7 @@
 
 use std::collections::VecDeque;
 
+use super::MAX_SILENCE;
 use super::counters::{ClientCounts, Latency, ServiceCounters};
 use super::document::{
     AlarmStatus, CommandStatus, ConfigFile, ControllerStatus, InterfaceStatus, Intruder, IntruderKind, MessageFlood,
@@ -20,13 +21,18 @@ use crate::monitor::{BusStatistics, CommandCounts, ControllerCount, Event, Event
 use crate::quantity::{BusIndex, Timestamp};
 use crate::sample::ReadingCounts;
 
-/// Maximum number of events in the document. This many events fill one screen.
-pub const MAX_EVENTS: usize = 32;
+/// Number of events that the document lists if nothing happened lately. This many events fill one screen.
+const MAX_EVENTS: usize = 32;
+/// Maximum number of events in the document after a burst: about 200 KB of JSON.
+const MAX_BURST: usize = 1024;
 
-/// The latest events. Events that occur once per cell and half-cycle are left out, because they would displace all
-/// other events.
+/// The latest events, and their number since the start of the daemon. Events that occur once per cell and half-cycle
+/// are left out, because they would displace all other events.
 #[derive(Debug, Default)]
-pub struct RecentEvents(VecDeque<Event>);
+pub struct RecentEvents {
+    latest: VecDeque<Event>,
+    count: u64,
+}
 
 impl RecentEvents {
     /// Adds an event.
@@ -35,10 +41,19 @@ impl RecentEvents {
         {
             return;
         }
-        if self.0.len() == MAX_EVENTS {
-            self.0.pop_front();
+        if self.latest.len() == MAX_BURST {
+            self.latest.pop_front();
         }
-        self.0.push_back(*event);
+        self.latest.push_back(*event);
+        self.count += 1;
+    }
+
+    /// The events to list at `now`: the latest [`MAX_EVENTS`], and all events of the last [`MAX_SILENCE`], so that a
+    /// reader that misses a few documents still receives each event.
+    fn listed(&self, now: Timestamp) -> Vec<Event> {
+        let older = self.latest.iter().take_while(|event| now.since(event.time) > MAX_SILENCE.as_secs_f64()).count();
+        let skipped = older.min(self.latest.len().saturating_sub(MAX_EVENTS));
+        self.latest.iter().skip(skipped).copied().collect()
     }
 }
 
@@ -102,7 +117,7 @@ pub struct Sources<'a> {
 impl Sources<'_> {
     /// Collects the document, which is serialised later.
     pub fn draft(self, now: Timestamp) -> Draft {
-        let events = self.events.0.iter().copied().collect();
+        let events = self.events.listed(now);
         Draft { document: self.document(now), events }
     }
 
@@ -146,6 +161,7 @@ impl Sources<'_> {
             findings: self.monitor.findings().to_vec(),
             latency: self.latency.clone(),
             store: self.store,
+            event_count: self.events.count,
             events: Vec::new(),
         }
     }
@@ -243,5 +259,21 @@ fn alarms(monitor: &Monitor) -> AlarmStatus {
         unknown: list.unknown,
         list: list.alarms,
         omitted: list.omitted,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn burst_is_listed_until_every_reader_had_time() {
+        let mut recent = RecentEvents::default();
+        for second in [0.0, 100.0] {
+            let time = Timestamp::from_secs(second);
+            (0..1000).for_each(|_| recent.note(&Event { time, kind: EventKind::Gap { seconds: None } }));
+        }
+        let listed = |second: f64| recent.listed(Timestamp::from_secs(second)).len();
+        assert_eq!((recent.count, listed(101.0), listed(106.0)), (2000, 1000, 32));
     }
 }

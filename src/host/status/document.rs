@@ -91,8 +91,12 @@ pub struct StatusDocument {
     pub latency: Latency,
     /// The store of state and history; `None` = disabled.
     pub store: Option<StoreStatus>,
+    /// Number of events since `started`. The last event in `events` has this number, the event before it has this
+    /// number minus one. 0 in documents of older versions.
+    #[serde(default)]
+    pub event_count: u64,
     /// The latest events, oldest first, in the format of `--events`; without events that occur once per cell and
-    /// half-cycle.
+    /// half-cycle. The list has 32 events, or more if more occurred in the last 5 s (at most 1,024).
     pub events: Vec<serde_json::Value>,
 }
 

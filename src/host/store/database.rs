@@ -21,8 +21,9 @@
 //!   cut, and a commit that has not returned leaves no trace.
 //! * A damaged file and an inaccessible file give different errors. A file with another format counts as damaged.
 
-use std::fs::File;
-use std::path::Path;
+use std::fs::{File, Metadata};
+use std::os::unix::fs::MetadataExt as _;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use rusqlite::types::Value;
@@ -36,6 +37,7 @@ use super::segments::{self, Segment, hex};
 use super::stamp::Stamp;
 use crate::alarm::AlarmChange;
 use crate::config::{StoreConfig, VehicleIdentity};
+use crate::io::place::with_suffix;
 use crate::monitor::{EventKind, LearnedCell};
 use crate::quantity::Timestamp;
 
@@ -128,6 +130,9 @@ pub(super) struct Database {
     segment: Segment,
     /// Number of the connected pack.
     pack: i64,
+    path: PathBuf,
+    /// Device and inode of the database and of its log when they were opened; `None` = no such file.
+    opened: [Option<(u64, u64)>; 2],
 }
 
 /// Limits of the history. If one is exceeded, the oldest segments are deleted.
@@ -177,7 +182,13 @@ impl Database {
         if last < pack {
             connection.execute("INSERT INTO pack (id, opened_ns) VALUES (?1, ?2)", params![pack, now.wall_ns])?;
         }
-        Ok(Self { connection, segment, pack })
+        Ok(Self { connection, segment, pack, path: path.to_owned(), opened: files_at(path) })
+    }
+
+    /// Whether the names of the database and its log still belong to the open files. If another program deletes or
+    /// replaces these files, commits still succeed, but everything they write is lost when the database is closed.
+    pub(super) fn has_its_names(&self) -> bool {
+        files_at(&self.path) == self.opened
     }
 
     /// Number of rows ever written.
@@ -265,6 +276,16 @@ impl Database {
     pub(super) fn connection(&self) -> &Connection {
         &self.connection
     }
+}
+
+/// Device and inode of a file.
+pub(super) fn file_id(file: &Metadata) -> (u64, u64) {
+    (file.dev(), file.ino())
+}
+
+/// Returns device and inode of the database at `path` and of its log.
+fn files_at(path: &Path) -> [Option<(u64, u64)>; 2] {
+    [path.to_owned(), with_suffix(path, "-wal")].map(|path| std::fs::metadata(path).ok().as_ref().map(file_id))
 }
 
 /// Returns the format of an open database.

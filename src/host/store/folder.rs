@@ -3,11 +3,11 @@
 //! A damaged database is renamed, reported, and replaced by an empty database.
 
 use std::fmt;
-use std::fs::{self, File, TryLockError};
+use std::fs::{self, File, Metadata, TryLockError};
 use std::io;
 use std::path::{Path, PathBuf};
 
-use super::database::{Database, OpenError};
+use super::database::{Database, OpenError, file_id};
 use super::rows::HistoryRow;
 use super::stamp::Stamp;
 use super::state_files;
@@ -58,16 +58,20 @@ impl Folder {
         fs::metadata(path).ok().map(|file| file.len() + log)
     }
 
-    /// Creates the folder if it does not exist, and locks it for this process.
+    /// Creates the folder if it does not exist, and locks it for this process. If the lock file has been deleted or
+    /// replaced, the old lock is worthless: another daemon can lock the new file.
     ///
     /// # Errors
     /// Returns `WouldBlock` if another process has locked the folder, else the reason why the folder cannot be written.
     pub(super) fn lock(&mut self) -> io::Result<()> {
-        if self.lock.is_some() {
+        let path = self.path.join(LOCK);
+        let id = |file: io::Result<Metadata>| file.ok().as_ref().map(file_id);
+        if self.lock.as_ref().is_some_and(|lock| id(lock.metadata()) == id(fs::metadata(&path))) {
             return Ok(());
         }
+        self.lock = None;
         fs::create_dir_all(&self.path)?;
-        let file = File::options().create(true).truncate(false).write(true).open(self.path.join(LOCK))?;
+        let file = File::options().create(true).truncate(false).write(true).open(path)?;
         match file.try_lock() {
             Ok(()) => {
                 self.lock = Some(file);

@@ -8,7 +8,8 @@ use std::collections::BTreeMap;
 
 use super::rows::HistoryRow;
 use crate::alarm::Change;
-use crate::monitor::{Event, EventKind};
+use crate::can::poll::{PollChange, PollSilence};
+use crate::monitor::{Command, Event, EventKind};
 use crate::quantity::catalogue::Quantity;
 use crate::quantity::{CellIndex, Timestamp};
 use crate::token_bucket::{BucketSize, TokenBucket};
@@ -197,7 +198,10 @@ impl Urgency {
             | EventKind::RechargePeriod { .. }
             | EventKind::Model { .. }
             | EventKind::PackReplaced { .. }
-            | EventKind::PackIdentity { .. } => Some(Self::WithState),
+            | EventKind::PackIdentity { .. }
+            // Requests after a restart depend on these two.
+            | EventKind::Command { command: Command::Poll { .. }, .. }
+            | EventKind::Poll(PollChange::Silent { reason: PollSilence::OtherTester }) => Some(Self::WithState),
             EventKind::Alarm { change: Change::Suppressed | Change::Resumed, .. } => None,
             EventKind::Alarm { .. } | EventKind::AlarmDropped { .. } => Some(Self::AsRow),
             EventKind::FilterReset { .. } => Some(Self::Deferred),
@@ -210,6 +214,7 @@ impl Urgency {
 mod tests {
     use super::super::rows::tests::{alarm, capacity, half_cycle, loss_modes, model, remaining_life};
     use super::*;
+    use crate::monitor::Source;
 
     /// Number of rows that are committed at once.
     fn take(history_filter: &mut HistoryFilter, seconds: f64, kinds: &[EventKind]) -> Option<usize> {
@@ -308,6 +313,21 @@ mod tests {
         assert_eq!([take(&[reset]), take(&[reset]), take(&[reset])], [None; 3]);
         assert_eq!(take(&[alarm(Change::Raised)]), Some((3, false)), "with the first and the last reset");
         assert_eq!(take(&[alarm(Change::Raised), half_cycle(0)]), Some((2, true)));
+    }
+
+    #[test]
+    fn silence_of_polling_is_committed_with_state() {
+        let command = EventKind::Command {
+            source: Source::Local,
+            command: Command::Poll { standby: true },
+            changed: 1,
+            refused: 0,
+        };
+        let tester = EventKind::Poll(PollChange::Silent { reason: PollSilence::OtherTester });
+        for kind in [command, tester] {
+            let commit = HistoryFilter::default().take(&[Event { time: Timestamp::ZERO, kind }]).unwrap();
+            assert!(commit.with_state, "{kind:?}");
+        }
     }
 
     #[test]

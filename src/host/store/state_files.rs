@@ -215,6 +215,11 @@ impl StateFiles {
         self.aside = Some(1 - self.next);
     }
 
+    /// Whether the newest state still has its name.
+    pub(super) fn is_present(&self) -> bool {
+        self.folder.join(FILES[1 - self.next]).exists()
+    }
+
     /// Overwrites the older state. The new state is durable when this function returns. Returns the size of the file.
     pub(super) fn write(&mut self, document: StateDocument) -> Result<u64, String> {
         let named = |name: &str, error: io::Error| format!("{}: {error}", self.folder.join(name).display());

@@ -179,6 +179,7 @@ fn writer(folder: &Path) -> Writer {
         retry: Retry::default(),
         knows_state: true,
         needs_state: true,
+        was_replaced: false,
     }
 }
 
@@ -292,6 +293,56 @@ fn database_damaged_while_running_is_set_aside() {
     assert_eq!(reader.verify().unwrap().broken, None);
     assert!(reader.state().is_some());
     assert!(place.path().join("packwatch.db.damaged-1").exists());
+}
+
+#[test]
+fn deleted_or_replaced_store_is_reported_and_written_again() {
+    let changes: [fn(&Path); 5] = [
+        |state| std::fs::remove_file(state.join(DATABASE)).unwrap(),
+        |state| std::fs::remove_file(state.join("packwatch.db-wal")).unwrap(),
+        |state| std::fs::remove_dir_all(state).unwrap(),
+        |state| std::fs::rename(state, state.with_extension("moved")).unwrap(),
+        |state| {
+            let copy = state.join("copy");
+            std::fs::copy(state.join(DATABASE), &copy).unwrap();
+            std::fs::rename(copy, state.join(DATABASE)).unwrap();
+        },
+    ];
+    for (number, change) in changes.into_iter().enumerate() {
+        let place = tempfile::tempdir().unwrap();
+        let state = place.path().join("state");
+        let open = || Store::open(&PlaceSetting::At(state.clone()), &config().store, &VehicleIdentity::default());
+        let mut store = open().unwrap().0.unwrap();
+        let learn = |store: &mut Store, seconds: f64| {
+            let (time, kind) = (Timestamp::from_secs(seconds), rows::tests::capacity(0, Some(2.0), 1.9));
+            let ticket = store.learned(&[Event { time, kind }], &at(seconds), time).unwrap();
+            answer(store, ticket)
+        };
+        assert!(learn(&mut store, 1.0).works, "{number}");
+        change(&state);
+        let progress = learn(&mut store, 2.0);
+        assert!(progress.works && progress.was_replaced, "{number}: {progress:?}");
+        assert!(open().is_err(), "{number}: the folder is locked again");
+        store.finish(&at(3.0), Timestamp::from_secs(3.0));
+        let reader = HistoryReader::open(&state).unwrap();
+        assert_eq!(reader.state().unwrap().snapshot.time, Timestamp::from_secs(3.0), "{number}");
+        let entries = reader.entries(&HistoryQuery::default()).unwrap();
+        assert!(entries.iter().any(|entry| entry.kind == HistoryTable::Capacity), "{number}: {entries:?}");
+    }
+}
+
+#[test]
+fn deleted_states_are_written_with_next_rows() {
+    let place = tempfile::tempdir().unwrap();
+    let mut writer = writer(place.path());
+    let commit = |writer: &mut Writer| {
+        let state = document(1, 100, 1_800_000_000);
+        let rows = vec![HistoryRow::Event(rows::tests::capacity(0, Some(2.0), 1.9))];
+        writer.commit(&mut vec![RowBatch { stamp: state.stamp, rows }], &state).unwrap()
+    };
+    assert!(commit(&mut writer).is_some() && commit(&mut writer).is_none());
+    state_files::forget(place.path()).unwrap();
+    assert!(commit(&mut writer).is_some() && StateFiles::open(place.path()).1.newest.is_some());
 }
 
 /// Returns a monitor whose time is `seconds`.

@@ -40,6 +40,8 @@ pub struct StoreProgress {
     pub works: bool,
     /// Whether the disk has room, that is, the reserve is unused.
     pub has_room: bool,
+    /// Whether another program has deleted or replaced the database while it was open. The rows in it are lost.
+    pub was_replaced: bool,
     /// Size of the database and its log after the last success, bytes; `None` = no success yet.
     pub file_bytes: Option<u64>,
     /// Successful commits.
@@ -174,6 +176,8 @@ pub(super) struct Writer {
     pub(super) knows_state: bool,
     /// Whether the next commit must write the state.
     pub(super) needs_state: bool,
+    /// Whether the database was found deleted or replaced while it was open.
+    pub(super) was_replaced: bool,
 }
 
 /// Time of the next attempt after a failure.
@@ -220,6 +224,7 @@ impl Writer {
                 false
             };
             (progress.ticket, progress.has_room) = (ticket, self.reserve.is_whole());
+            progress.was_replaced |= self.was_replaced;
             self.progress.send_if_modified(|last| std::mem::replace(last, progress) != progress);
             if stop {
                 return;
@@ -305,7 +310,7 @@ impl Writer {
             // A state that has not been read yet must not be overwritten.
             return rows.map(|()| None);
         }
-        if rows.is_ok() && !self.needs_state {
+        if rows.is_ok() && !self.needs_state && self.state_files.is_present() {
             return Ok(None);
         }
         let mut document = document.clone();
@@ -319,6 +324,7 @@ impl Writer {
 
     fn commit_rows(&mut self, batches: &[RowBatch], now: &Stamp) -> Result<(), String> {
         let limits = self.limits;
+        self.close_if_replaced();
         let database = self.open(now)?;
         let written = if batches.is_empty() { database.apply(&limits, now) } else { database.commit(batches) };
         if let Err(error) = written {
@@ -329,8 +335,22 @@ impl Writer {
             }
             return Err(error.to_string());
         }
+        if self.close_if_replaced() {
+            return Err("the database was deleted or replaced during the commit".to_owned());
+        }
         self.log_head(now);
         Ok(())
+    }
+
+    /// Closes the database if another program has deleted or replaced its files. [`open`](Self::open) then uses the
+    /// file of this name, or creates it.
+    fn close_if_replaced(&mut self) -> bool {
+        let is_replaced = self.database.as_ref().is_some_and(|database| !database.has_its_names());
+        if is_replaced {
+            tracing::error!(folder = %self.folder, "another program has deleted or replaced the open database");
+            (self.database, self.was_replaced) = (None, true);
+        }
+        is_replaced
     }
 
     /// Logs the chain's end with the first commit of each day. A rewritten chain does not match the logged end.
@@ -361,6 +381,10 @@ impl Writer {
         let pack = self.progress.borrow().pack;
         self.needs_state = true;
         let (mut database, mut rows) = self.folder.open(now, pack).map_err(|error| error.to_string())?;
+        if self.was_replaced {
+            let detail = "another program deleted or replaced the open database".to_owned();
+            rows.push(HistoryRow::Own { reason: "replaced", detail });
+        }
         if !self.knows_state {
             let (files, found) = StateFiles::open(self.folder.path());
             self.state_files = files;

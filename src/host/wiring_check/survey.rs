@@ -9,6 +9,7 @@ mod beside;
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use crate::bounded_file;
 use crate::can::dbc::{Message, Signal};
 use crate::can::decode::{Binding, InputMap};
 use crate::can::encode::SentMessage;
@@ -55,7 +56,7 @@ impl Survey {
 /// # Errors
 /// Fails if no interface is configured or no signal can be found, and returns all faults.
 pub fn survey(path: &Path) -> Result<Survey, ConfigFaults> {
-    survey_with(path, &|path: &Path| std::fs::read(path))
+    survey_with(path, &bounded_file::read)
 }
 
 /// Like [`survey`], but reads files with `read`.

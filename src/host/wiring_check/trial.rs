@@ -10,6 +10,7 @@ use std::path::{Path, PathBuf};
 
 use super::Survey;
 use super::survey::survey_with;
+use crate::bounded_file;
 use crate::wiring::{Change, Severity, Topic, WiringFinding, WiringReport};
 
 /// Maximum number of trials, because every trial reads the logs again.
@@ -128,14 +129,14 @@ fn changed(config: &Path, changes: &[Change]) -> Option<Survey> {
     placed.sort_by_key(|(_, line, _)| std::cmp::Reverse(*line));
     for (file, line, change) in placed {
         if !texts.contains_key(&file) {
-            let text = std::fs::read_to_string(&file).ok()?;
+            let text = bounded_file::read_text(&file).ok()?;
             texts.insert(file.clone(), text.lines().map(str::to_owned).collect());
         }
         apply(texts.get_mut(&file)?, line, change)?;
     }
     let read = |path: &Path| match texts.get(path) {
         Some(lines) => Ok((lines.join("\n") + "\n").into_bytes()),
-        None => std::fs::read(path),
+        None => bounded_file::read(path),
     };
     survey_with(config, &read).ok()
 }

@@ -21,6 +21,7 @@ use serde_json::json;
 use self::rows::{AlarmRow, EstimateRow, HalfCycleRow};
 use self::table::TableFile;
 use super::drive::{DriveSummary, LogAccess, drive};
+use super::vehicle::LearnedModel;
 
 use crate::config::Config;
 use crate::error::{LabError, create_folder};
@@ -84,6 +85,9 @@ pub struct ExportResult {
     pub days: f64,
     /// Notes for the user.
     pub notes: Vec<String>,
+    /// The model that was learned from the log.
+    #[serde(skip)]
+    pub model: Option<LearnedModel>,
 }
 
 /// Exports all logs. Returns the result or the error of each log. `report` receives the number of bytes read since its
@@ -120,7 +124,12 @@ pub(super) fn export(
     let out = Outputs { want_estimates: true, ..Outputs::default() };
     let source = (settings.access.open)(config, logs);
     let log = Path::new(&logs.iter().map(|log| log.display().to_string()).collect::<Vec<_>>().join(", ")).to_owned();
+    let mut model = None;
     let mut each = |monitor: &Monitor, out: &mut Outputs| {
+        if out.events.iter().any(|event| matches!(event.kind, EventKind::Model { .. })) {
+            let view = monitor.model();
+            model = view.label.zip(view.own.cloned()).map(|(label, own)| LearnedModel { label, own });
+        }
         let result = tables.take(monitor, out);
         out.clear();
         result
@@ -132,7 +141,7 @@ pub(super) fn export(
     let mut notes = driven.notes.clone();
     notes.extend(remove_about(&folder, &log)?);
     let rows = tables.finish(&metadata)?;
-    let exported = ExportResult { log, folder, rows, days: driven.days(), notes };
+    let exported = ExportResult { log, folder, rows, days: driven.days(), notes, model };
     write_about(&exported, &driven, metadata)?;
     Ok(exported)
 }

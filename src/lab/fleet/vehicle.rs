@@ -5,8 +5,10 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
+use crate::cell::{Label, OwnModel};
+
 /// Version of `vehicle.json`.
-pub(super) const VERSION: u32 = 1;
+pub(super) const VERSION: u32 = 2;
 /// Name of the file with the result, in the vehicle's folder.
 pub(super) const RECORD: &str = "vehicle.json";
 
@@ -51,6 +53,18 @@ pub struct VehicleRecord {
     pub days: f64,
     /// Notes on the logs.
     pub notes: Vec<String>,
+    /// The model of the vehicle's cells that was learned from the logs; `None` = none was learned.
+    pub model: Option<LearnedModel>,
+}
+
+/// A model that was learned from the logs of a vehicle, with the label from which learning started.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LearnedModel {
+    /// The label.
+    pub label: Label,
+    /// The model.
+    pub own: OwnModel,
 }
 
 impl VehicleRecord {

@@ -221,6 +221,7 @@ fn replay(
         rated_ah: config.as_ref().ok().map(|config| config.monitor.model.rated_capacity_ah),
         days: 0.0,
         notes: Vec::new(),
+        model: None,
     };
     std::fs::create_dir_all(&folder).map_err(|error| named(&folder, &error))?;
     let lock = std::fs::File::create(folder.join(LOCK)).and_then(|file| file.lock().map(|()| file));
@@ -250,7 +251,7 @@ fn replay(
     }) {
         Ok(exported) => {
             record.rows = exported.rows.iter().map(|(table, rows)| ((*table).to_owned(), *rows)).collect();
-            (record.days, record.notes) = (exported.days, exported.notes);
+            (record.days, record.notes, record.model) = (exported.days, exported.notes, exported.model);
             write(&folder, &record)?;
             Ok(Outcome::Replayed(record))
         }

@@ -13,6 +13,7 @@ use super::{ColumnTable, interval, split, table, write_csv};
 use crate::error::LabError;
 use crate::io::json::json_fault;
 use crate::regress::{GprSettings, Model, Prediction, ProgressCallback, TrainingRows, fit};
+use packwatch_host::bounded_file;
 
 /// Format name in the first line.
 const FORMAT: &str = "packwatch gpr";
@@ -86,7 +87,7 @@ impl TrainedModel {
         if size > MAX_BYTES {
             return Err(fail(format!("{size} bytes, must be at most {MAX_BYTES}")));
         }
-        let text = std::fs::read_to_string(path).map_err(unread)?;
+        let text = bounded_file::read_text(path).map_err(unread)?;
         let (first, rest) = text
             .split_once('\n')
             .ok_or_else(|| fail("has one line, must have three: not a model file of `packwatch gpr train`".into()))?;

@@ -42,6 +42,33 @@ pub fn passport(standard: Standard, condition: &Condition, manufacturer: Value) 
     if faults.is_empty() { Ok(document) } else { Err(faults) }
 }
 
+/// Returns the manufacturer's part with `null` for each value. It has every member that no record contains.
+pub fn template(standard: Standard) -> Value {
+    let places: Vec<String> = places(standard)
+        .flat_map(|(_, place)| [joined(place.group, place.value), joined(place.group, place.time)])
+        .collect();
+    let shape = standards::shape(standard);
+    shape.template("", &|path| places.iter().any(|place| place == path)).unwrap_or_default()
+}
+
+/// Removes `null` values of a template that the manufacturer did not fill in, and the objects and lists that only
+/// contained such values. An empty object or list stays, because the manufacturer wrote it.
+pub fn without_nulls(value: Value) -> Option<Value> {
+    match value {
+        Value::Null => None,
+        Value::Object(members) if !members.is_empty() => {
+            let known: Map<String, Value> =
+                members.into_iter().filter_map(|(name, value)| Some((name, without_nulls(value)?))).collect();
+            (!known.is_empty()).then_some(Value::Object(known))
+        }
+        Value::Array(items) if !items.is_empty() => {
+            let known: Vec<Value> = items.into_iter().filter_map(without_nulls).collect();
+            (!known.is_empty()).then_some(Value::Array(known))
+        }
+        other => Some(other),
+    }
+}
+
 /// Returns every value with its unit, definition, standard deviation and time, and the reason for each absent value.
 pub fn details(standard: Standard, condition: &Condition, vehicle: &VehicleIdentity) -> Value {
     let (mut values, mut absent) = (Vec::new(), Vec::new());

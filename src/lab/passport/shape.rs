@@ -115,6 +115,24 @@ impl Shape {
         }
     }
 
+    /// A document with every member that is not measured: `null` for each value, and one item in each list. `None` = every
+    /// member is measured.
+    pub(super) fn template(&self, path: &str, is_measured: &dyn Fn(&str) -> bool) -> Option<Value> {
+        Some(match self {
+            _ if is_measured(path) => return None,
+            Self::Leaf(_) => Value::Null,
+            Self::List { item, .. } => Value::Array(vec![item.template(path, is_measured)?]),
+            Self::Object(members) => {
+                let inner = members.iter().filter_map(|member| {
+                    let value = member.shape.template(&joined(path, &member.name), is_measured)?;
+                    Some((member.name.clone(), value))
+                });
+                let inner: Map<String, Value> = inner.collect();
+                return (!inner.is_empty()).then_some(Value::Object(inner));
+            }
+        })
+    }
+
     /// Checks a document. A missing object counts as one missing member. If `is_opened` returns true for the path of
     /// the object, the required members of the object count instead.
     pub(super) fn check(&self, document: &Value, is_opened: &dyn Fn(&str) -> bool) -> Verdict {

@@ -45,8 +45,9 @@ pub(crate) struct Routes {
 }
 
 impl Routes {
-    /// Searches the broker's metadata for every signal. The overlay's signals are below `branch`.
-    pub(crate) fn resolve(metadata: &[Metadata], branch: &str) -> (Self, Vec<SkippedSignal>) {
+    /// Searches the broker's metadata for every signal. The overlay's signals are below `branch`. `is_from_new`: whether
+    /// sums over the life of the battery are known.
+    pub(crate) fn resolve(metadata: &[Metadata], branch: &str, is_from_new: bool) -> (Self, Vec<SkippedSignal>) {
         let mut uses: HashMap<i32, usize> = HashMap::new();
         let mut by_path: HashMap<&str, &Metadata> = HashMap::new();
         for entry in metadata {
@@ -56,7 +57,7 @@ impl Routes {
             }
         }
         let (mut by_id, mut skipped) = (BTreeMap::new(), Vec::new());
-        for signal in signals::all() {
+        for signal in signals::all().filter(|signal| is_from_new || !signal.is_lifetime()) {
             let path = signal.path(branch);
             let found = by_path.get(path.as_str()).copied();
             match found

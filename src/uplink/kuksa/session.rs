@@ -124,7 +124,7 @@ impl Session {
         if !settings.branch.starts_with(&format!("{STANDARD_BRANCH}.")) {
             metadata.extend(call("ListMetadata", list(&mut client, &settings.branch)).await?);
         }
-        let (routes, skipped) = Routes::resolve(&metadata, &settings.branch);
+        let (routes, skipped) = Routes::resolve(&metadata, &settings.branch, settings.recorded_from_new);
         journal.note_skipped(skipped);
         if routes.len() == 0 {
             return Err(format!("the broker has no signal of {STANDARD_BRANCH} that this program provides"));

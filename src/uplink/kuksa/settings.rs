@@ -25,6 +25,8 @@ pub struct KuksaSettings {
     pub token_file: Option<PathBuf>,
     /// Branch of the overlay's signals.
     pub branch: String,
+    /// Whether the daemon has run with the battery since it was new, so that its sums are those of the battery's life.
+    pub recorded_from_new: bool,
 }
 
 impl Default for KuksaSettings {
@@ -35,6 +37,7 @@ impl Default for KuksaSettings {
             server_name: None,
             token_file: None,
             branch: format!("{STANDARD_BRANCH}.Packwatch"),
+            recorded_from_new: false,
         }
     }
 }

@@ -84,6 +84,11 @@ impl Signal {
         }
     }
 
+    /// Whether the signal is a sum over the life of the battery.
+    pub(crate) fn is_lifetime(&self) -> bool {
+        self.fields.starts_with("pack.moved.")
+    }
+
     /// Whether the signal is a quantity of the catalogue.
     pub(crate) fn is_quantity(&self) -> bool {
         !matches!(self.source, Source::Document(_))

@@ -12,6 +12,7 @@ pub(crate) enum DataType {
     Flag,
     Uint16,
     Uint32,
+    Uint64,
     Float,
     Texts,
     Flags,
@@ -26,6 +27,7 @@ impl DataType {
             Self::Flag => "boolean",
             Self::Uint16 => "uint16",
             Self::Uint32 => "uint32",
+            Self::Uint64 => "uint64",
             Self::Float => "float",
             Self::Texts => "string[]",
             Self::Flags => "boolean[]",
@@ -40,6 +42,7 @@ impl DataType {
             Self::Flag => 2,
             Self::Uint16 => 8,
             Self::Uint32 => 9,
+            Self::Uint64 => 10,
             Self::Float => 11,
             Self::Texts => 20,
             Self::Flags => 21,
@@ -80,6 +83,7 @@ pub(crate) enum Value {
     Flag(bool),
     Uint16(u16),
     Uint32(u32),
+    Uint64(u64),
     Float(f32),
     Texts(Vec<String>),
     Flags(Vec<bool>),
@@ -94,6 +98,7 @@ impl Value {
             Self::Flag(_) => DataType::Flag,
             Self::Uint16(_) => DataType::Uint16,
             Self::Uint32(_) => DataType::Uint32,
+            Self::Uint64(_) => DataType::Uint64,
             Self::Float(_) => DataType::Float,
             Self::Texts(_) => DataType::Texts,
             Self::Flags(_) => DataType::Flags,
@@ -106,6 +111,8 @@ impl Value {
         match self {
             Self::Uint16(number) => limits.contain(f64::from(*number)),
             Self::Uint32(number) => limits.contain(f64::from(*number)),
+            #[expect(clippy::cast_precision_loss, reason = "compared with limits that are not that exact")]
+            Self::Uint64(number) => limits.contain(*number as f64),
             Self::Float(number) => limits.contain(f64::from(*number)),
             Self::Floats(numbers) => numbers.iter().all(|number| limits.contain(f64::from(*number))),
             Self::Text(_) | Self::Flag(_) | Self::Texts(_) | Self::Flags(_) => true,
@@ -119,6 +126,7 @@ impl Value {
             Self::Flag(flag) => TypedValue::Flag(flag),
             Self::Uint16(number) => TypedValue::Uint32(number.into()),
             Self::Uint32(number) => TypedValue::Uint32(number),
+            Self::Uint64(number) => TypedValue::Uint64(number),
             Self::Float(number) => TypedValue::Float(number),
             Self::Texts(values) => TypedValue::Texts(Texts { values }),
             Self::Flags(values) => TypedValue::Flags(Flags { values }),
@@ -156,7 +164,8 @@ pub(crate) fn limit(value: Option<&super::messages::Value>) -> Option<f64> {
         TypedValue::Uint32(number) => Some(f64::from(*number)),
         TypedValue::Float(number) => Some(f64::from(*number)),
         TypedValue::Double(number) => Some(*number),
-        // This program has no 64-bit signals.
+        #[expect(clippy::cast_precision_loss, reason = "limits are not that exact")]
+        TypedValue::Uint64(number) => Some(*number as f64),
         _ => None,
     }
 }
@@ -189,6 +198,7 @@ mod tests {
             DataType::Flag,
             DataType::Uint16,
             DataType::Uint32,
+            DataType::Uint64,
             DataType::Float,
             DataType::Texts,
             DataType::Flags,

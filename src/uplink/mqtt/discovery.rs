@@ -18,6 +18,7 @@ const UPLINK: &[(&str, &str, &str, &str, &str)] = &[
     ("queue_bytes", "Uplink Queue Size", "B", "data_size", "measurement"),
     ("dropped_samples", "Uplink Dropped Samples", "", "", "total_increasing"),
     ("dropped_events", "Uplink Dropped Events", "", "", "total_increasing"),
+    ("missed_events", "Uplink Missed Events", "", "", "total_increasing"),
 ];
 
 /// Every discovery message.
@@ -28,6 +29,9 @@ pub fn messages(settings: &MqttSettings, document: &StatusDocument) -> Vec<Messa
         describe(&mut config, entity.kind);
         if entity.is_diagnostic {
             config["entity_category"] = "diagnostic".into();
+        }
+        if !entity.is_enabled {
+            config["enabled_by_default"] = false.into();
         }
         device.message("sensor", &entity.key, &config)
     });
@@ -123,6 +127,7 @@ impl<'a> Device<'a> {
         let key = format!("battery_voltage_cell{number}");
         let mut config = self.entity(&name, &key, topic::CELLS, &format!("cell_voltages_mv[{index}]"));
         describe(&mut config, Kind::Measured { unit: "mV", class: "voltage", decimals: 0 });
+        config["enabled_by_default"] = false.into();
         self.message("sensor", &format!("cell_voltage{number}"), &config)
     }
 

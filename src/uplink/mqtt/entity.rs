@@ -46,6 +46,8 @@ pub struct Entity {
     pub kind: Kind,
     /// Whether the entity describes the daemon instead of the pack.
     pub is_diagnostic: bool,
+    /// Whether Home Assistant shows the entity at once; otherwise the user turns it on.
+    pub is_enabled: bool,
     source: Source,
 }
 
@@ -58,11 +60,18 @@ enum Source {
 impl Entity {
     const fn new(key: &'static str, name: &'static str, kind: Kind, value: fn(&StatusDocument) -> Value) -> Self {
         let source = Source::Document(value);
-        Self { key: Cow::Borrowed(key), name: Cow::Borrowed(name), kind, is_diagnostic: false, source }
+        Self {
+            key: Cow::Borrowed(key),
+            name: Cow::Borrowed(name),
+            kind,
+            is_diagnostic: false,
+            is_enabled: true,
+            source,
+        }
     }
 
     fn diagnostic(self) -> Self {
-        Self { is_diagnostic: true, ..self }
+        Self { is_diagnostic: true, is_enabled: false, ..self }
     }
 
     /// The entity's value; `null` if unknown.
@@ -81,6 +90,9 @@ pub fn published(quantity: Quantity, part: Part, value: Option<f64>) -> Value {
     rounded(value.map(|value| factor * value), decimals)
 }
 
+/// Device class of a state of charge.
+const BATTERY: &str = "battery";
+
 struct Measure {
     unit: &'static str,
     class: &'static str,
@@ -97,8 +109,7 @@ impl Measure {
 /// How numbers with this unit are published, and the factor by which they are multiplied.
 const fn measure(unit: Unit) -> (Measure, f64) {
     let (unit, class, decimals, factor) = match unit {
-        Unit::Level => ("%", "battery", 2, 100.0),
-        Unit::Fraction => ("%", "", 2, 100.0),
+        Unit::Level | Unit::Fraction => ("%", "", 2, 100.0),
         Unit::Ratio => ("", "", 3, 1.0),
         Unit::Volts => ("V", "voltage", 3, 1.0),
         Unit::Amperes => ("A", "current", 3, -1.0),
@@ -119,9 +130,9 @@ fn of_catalogue() -> impl Iterator<Item = Entity> {
         row.parts().map(move |(part, _)| {
             let (measure, _) = measure(row.unit);
             let (ending, name, class) = match part {
+                // The device class `battery` is for the state of charge; Home Assistant warns if such a value is low.
+                Part::Mean if row.quantity == Quantity::Soc => ("", name.into(), BATTERY),
                 Part::Mean => ("", name.into(), measure.class),
-                // The device class `battery` is for levels, so it does not fit a standard deviation.
-                Part::Std if row.unit == Unit::Level => ("_std", format!("{name} Standard Deviation").into(), ""),
                 Part::Std => ("_std", format!("{name} Standard Deviation").into(), measure.class),
             };
             Entity {
@@ -129,6 +140,7 @@ fn of_catalogue() -> impl Iterator<Item = Entity> {
                 name,
                 kind: Measure { class, ..measure }.kind(),
                 is_diagnostic: false,
+                is_enabled: part == Part::Mean,
                 source: Source::Catalogue(row.quantity, part),
             }
         })
@@ -149,7 +161,7 @@ fn derived() -> [Entity; 19] {
     [
         Entity::new("time", "Time of the Values", Kind::Time, |d| stamp(d.wall_time).into()).diagnostic(),
         // Battery-Emulator also has a scaled SOC. Here, the scaled and the real SOC are equal.
-        Entity::new("SOC_real", "SoC (real)", measure(Unit::Level).0.kind(), |d| {
+        Entity::new("SOC_real", "SoC (real)", Measure { class: BATTERY, ..measure(Unit::Level).0 }.kind(), |d| {
             published(Quantity::Soc, Part::Mean, d.pack.values.mean(Quantity::Soc))
         }),
         Entity::new("temperature_min", "Temperature Min", measure(Unit::Celsius).0.kind(), |d| {

@@ -288,6 +288,7 @@ fn uplink(fill: Fill) -> String {
         "queue_bytes": fill.bytes,
         "dropped_samples": fill.dropped_samples,
         "dropped_events": fill.dropped_events,
+        "missed_events": fill.missed_events,
     })
     .to_string()
 }

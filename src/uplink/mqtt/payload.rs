@@ -7,9 +7,10 @@ use packwatch_host::monitor::CellView;
 use packwatch_host::quantity::Timestamp;
 use packwatch_host::quantity::catalogue::{CellValues, Part, Quantity};
 use packwatch_host::status::document::{AlarmStatus, StatusDocument};
+use packwatch_host::status::event_words::words;
 use serde_json::{Map, Value, json};
 
-use super::entity::{entities, published, rounded, stamp};
+use super::entity::{entities, published, stamp};
 
 /// Values of the pack: every entity, and `alarms` with the state of each rule that has a threshold.
 pub fn info(document: &StatusDocument) -> Value {
@@ -64,36 +65,9 @@ pub fn event(document: &StatusDocument, event: &Value) -> Value {
         "time": time,
         "event_type": text("rule").filter(|_| name == "alarm").unwrap_or(name),
         "severity": text("severity").unwrap_or("info"),
-        "message": message(name, event),
+        "message": words(event, document),
         "data": event,
     })
-}
-
-/// Describes the event in one line. An alarm gives `capacity_low raised, cell 1, threshold 2.5, value 2.41`. Any other
-/// event gives its name and its values.
-fn message(name: &str, event: &Value) -> String {
-    let text = |key: &str| event.get(key).and_then(Value::as_str).unwrap_or("?");
-    let is_alarm = name == "alarm";
-    let mut words = if is_alarm { format!("{} {}", text("rule"), text("change")) } else { name.replace('_', " ") };
-    let shown = ["cell", "value", "threshold"];
-    for (key, value) in event.as_object().into_iter().flatten() {
-        let is_shown =
-            if is_alarm { shown.contains(&key.as_str()) } else { !["event", "time"].contains(&key.as_str()) };
-        match (key.as_str(), value) {
-            (_, Value::Null) => {}
-            ("cell", Value::Number(cell)) => words += &format!(", cell {}", cell.as_u64().unwrap_or_default() + 1),
-            (_, Value::Number(number)) if is_shown => words += &format!(", {key} {}", short(number.as_f64())),
-            (_, Value::String(word)) if is_shown => words += &format!(", {key} {word}"),
-            (_, Value::Bool(flag)) if is_shown => words += &format!(", {key} {flag}"),
-            _ => {}
-        }
-    }
-    words
-}
-
-/// Formats a number with at most four decimals.
-fn short(number: Option<f64>) -> String {
-    rounded(number, 4).to_string()
 }
 
 /// Rounds to a whole number; `null` if the value is unknown or not finite.

@@ -21,6 +21,8 @@ const FILE: &str = "queue.db";
 const LOCK: &str = "queue.lock";
 /// Layout version of the file.
 const VERSION: i64 = 1;
+/// Class of the missed events in the table `dropped`.
+const MISSED: i64 = 2;
 /// Number of pages (4 KiB each) in the write-ahead log that cause a checkpoint: 1 MiB.
 const CHECKPOINT_PAGES: i64 = 256;
 
@@ -53,6 +55,8 @@ pub struct Fill {
     pub dropped_samples: u64,
     /// Events dropped.
     pub dropped_events: u64,
+    /// Events that were never queued, because the daemon no longer listed them.
+    pub missed_events: u64,
 }
 
 /// The queue.
@@ -107,13 +111,13 @@ impl Queue {
         self.added.notified()
     }
 
-    /// Adds messages. In the same transaction, stores `seen`, if given: the recorder's text that lists the events it
-    /// has already handled. [`Self::seen`] returns this text, also after a restart. When this function returns, the
-    /// messages and `seen` are on disk.
+    /// Adds messages. In the same transaction, stores `seen`, if given: the recorder's text about the events it has
+    /// already handled, and the number of events missed since the previous text. [`Self::seen`] returns the text, also
+    /// after a restart. When this function returns, the messages and `seen` are on disk.
     ///
     /// # Errors
     /// Fails if the disk fails or is full.
-    pub fn add(&self, messages: &[(Class, String)], seen: Option<&str>) -> Result<(), String> {
+    pub fn add(&self, messages: &[(Class, String)], seen: Option<(&str, u64)>) -> Result<(), String> {
         let mut database = self.database.borrow_mut();
         let fill = self.try_add(&mut database, messages, seen).map_err(|error| error.to_string())?;
         self.fill.set(fill);
@@ -125,7 +129,7 @@ impl Queue {
         &self,
         database: &mut Connection,
         messages: &[(Class, String)],
-        seen: Option<&str>,
+        seen: Option<(&str, u64)>,
     ) -> rusqlite::Result<Fill> {
         let mut fill = self.fill.get();
         let transaction = database.transaction()?;
@@ -141,14 +145,16 @@ impl Queue {
                 break;
             }
         }
-        if let Some(seen) = seen {
+        if let Some((seen, missed)) = seen {
             transaction.execute("INSERT OR REPLACE INTO seen VALUES (0, ?)", [seen])?;
+            count_lost(&transaction, MISSED, missed)?;
+            fill.missed_events += missed;
         }
         transaction.commit()?;
         Ok(fill)
     }
 
-    /// Returns the text that lists the events already handled: the text stored by the latest [`Self::add`] with `seen`.
+    /// Returns the text about the events already handled: the text stored by the latest [`Self::add`] with `seen`.
     /// `None` if no text is stored, or if it cannot be read.
     pub fn seen(&self) -> Option<String> {
         let database = self.database.borrow();
@@ -289,15 +295,15 @@ fn with_suffix(path: &Path, suffix: &str) -> PathBuf {
 }
 
 fn read_fill(database: &Connection) -> rusqlite::Result<Fill> {
-    let dropped = |class: Class| {
-        let count =
-            database.query_row("SELECT count FROM dropped WHERE class = ?", [class as i64], |row| count(row, 0));
+    let dropped = |class: i64| {
+        let count = database.query_row("SELECT count FROM dropped WHERE class = ?", [class], |row| count(row, 0));
         count.optional().map(Option::unwrap_or_default)
     };
     // The size is in bytes, as in `length`. Without the cast, SQLite would count characters.
     let size = "SELECT count(*), coalesce(sum(length(CAST(body AS BLOB))), 0) FROM message";
     let (messages, bytes) = database.query_row(size, [], |row| Ok((count(row, 0)?, count(row, 1)?)))?;
-    Ok(Fill { messages, bytes, dropped_samples: dropped(Class::Sample)?, dropped_events: dropped(Class::Event)? })
+    let (dropped_samples, dropped_events) = (dropped(Class::Sample as i64)?, dropped(Class::Event as i64)?);
+    Ok(Fill { messages, bytes, dropped_samples, dropped_events, missed_events: dropped(MISSED)? })
 }
 
 /// Drops the oldest sample. If the queue has no samples, drops the oldest event. If the queue is empty, returns
@@ -310,12 +316,18 @@ fn drop_oldest(transaction: &Transaction<'_>, fill: &mut Fill) -> rusqlite::Resu
         .query_row([], |row| Ok((row.get::<_, i64>(0)?, count(row, 1)?)))
         .optional()?;
     let Some((class, bytes)) = dropped else { return Ok(false) };
-    let count = "INSERT INTO dropped VALUES (?, 1) ON CONFLICT (class) DO UPDATE SET count = count + 1";
-    transaction.prepare_cached(count)?.execute([class])?;
+    count_lost(transaction, class, 1)?;
     fill.messages -= 1;
     fill.bytes -= bytes;
     *(if class == Class::Event as i64 { &mut fill.dropped_events } else { &mut fill.dropped_samples }) += 1;
     Ok(true)
+}
+
+/// Adds to the number of lost messages of a class.
+fn count_lost(transaction: &Transaction<'_>, class: i64, messages: u64) -> rusqlite::Result<()> {
+    let count = "INSERT INTO dropped VALUES (?1, ?2) ON CONFLICT (class) DO UPDATE SET count = count + ?2";
+    let messages = i64::try_from(messages).unwrap_or(i64::MAX);
+    transaction.prepare_cached(count)?.execute([class, messages]).map(|_| ())
 }
 
 #[cfg(test)]

@@ -1,17 +1,18 @@
 //! Implements the recorder, which selects the documents to queue as samples, and the new events.
 //!
 //! Input: the daemon's documents. Output: messages in the [`Queue`], even if the broker cannot be reached. The daemon's
-//! clock decides when a sample is due. Each document lists the latest events. The recorder finds new events by
-//! comparing the lists of two documents, also across its own restart. If so many events occur between two documents
-//! that some have left the list, these are missed, and a warning is logged. Events that leave the list while this
-//! program does not run are also missed.
+//! clock decides when a sample is due. Each document lists the latest events, and the daemon numbers its events from its
+//! start. From the numbers the recorder finds the new events, and how many new events the document no longer lists,
+//! also across its own restart. These events are missed: they are counted, logged, and queued as one event
+//! `events_missed` in their place. A restart of the daemon is queued as an event `daemon_restarted`, because events that
+//! the previous run reported after its last received document are unknown.
 
 use std::cell::Cell;
 
 use packwatch_host::quantity::Timestamp;
-use packwatch_host::status::collect::MAX_EVENTS;
 use packwatch_host::status::document::StatusDocument;
-use serde_json::Value;
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
 
 use super::payload;
 use super::queue::{Class, Fill, Queue};
@@ -21,13 +22,21 @@ use crate::status_stream::Documents;
 /// about once a second.
 const TOLERANCE_S: f64 = 0.5;
 
+/// The events already handled: the daemon's run, which its start identifies, and the number of its latest event.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+struct Handled {
+    started: Timestamp,
+    count: u64,
+}
+
 /// State of the recorder.
 #[derive(Debug)]
 pub struct Recorder<'a> {
     queue: &'a Queue,
     period_s: u64,
     due: Option<Timestamp>,
-    events: Vec<Value>,
+    handled: Option<Handled>,
+    is_numbered: bool,
     works: Cell<bool>,
     drops: Cell<bool>,
 }
@@ -35,8 +44,9 @@ pub struct Recorder<'a> {
 impl<'a> Recorder<'a> {
     /// Creates a recorder that queues a sample every `period_s` seconds; 0 = no samples.
     pub fn new(queue: &'a Queue, period_s: u64) -> Self {
-        let events = queue.seen().and_then(|seen| serde_json::from_str(&seen).ok()).unwrap_or_default();
-        Self { queue, period_s, due: None, events, works: Cell::new(true), drops: Cell::new(false) }
+        let handled = queue.seen().and_then(|seen| serde_json::from_str(&seen).ok());
+        let (works, drops) = (Cell::new(true), Cell::new(false));
+        Self { queue, period_s, due: None, handled, is_numbered: true, works, drops }
     }
 
     /// Handles documents until the stream ends.
@@ -53,22 +63,20 @@ impl<'a> Recorder<'a> {
     /// Queues the new events of a document, and a sample if a sample is due. If the disk fails, retries with the next
     /// document.
     pub fn take(&mut self, document: &StatusDocument) {
-        let news = new_events(&self.events, &document.events);
-        if !self.events.is_empty() && news.len() == document.events.len() && news.len() >= MAX_EVENTS {
-            tracing::warn!(listed = news.len(), "the daemon had more new events than it lists; some may be missing");
-        }
+        let (events, missed) = self.new_events(document);
         let mut messages: Vec<_> =
-            news.iter().map(|event| (Class::Event, payload::event(document, event).to_string())).collect();
+            events.iter().map(|event| (Class::Event, payload::event(document, event).to_string())).collect();
         let next = self.next_due(document.time);
         if next.is_some() {
             messages.push((Class::Sample, payload::sample(document).to_string()));
         }
-        if messages.is_empty() {
+        let handled = Handled { started: document.started, count: document.event_count };
+        if messages.is_empty() && self.handled == Some(handled) {
             return;
         }
-        let seen = (!news.is_empty()).then(|| Value::from(document.events.clone()).to_string());
+        let seen = serde_json::to_string(&handled).unwrap_or_default();
         let before = self.queue.fill();
-        let result = self.queue.add(&messages, seen.as_deref());
+        let result = self.queue.add(&messages, (self.handled != Some(handled)).then_some((&seen, missed)));
         self.note_drops(before, self.queue.fill());
         if self.works.replace(result.is_ok()) != result.is_ok() {
             match &result {
@@ -78,8 +86,41 @@ impl<'a> Recorder<'a> {
         }
         if result.is_ok() {
             self.due = next.or(self.due);
-            self.events.clone_from(&document.events);
+            self.handled = Some(handled);
+            if missed > 0 {
+                tracing::warn!(missed, "the daemon no longer lists some of its events");
+            }
         }
+    }
+
+    /// The events to queue, and the number of missed events. On the very first document, only the listed events are
+    /// new, because the uplink has missed nothing before it existed.
+    fn new_events(&mut self, document: &StatusDocument) -> (Vec<Value>, u64) {
+        let (total, listed) = (document.event_count, document.events.len() as u64);
+        if total < listed {
+            if std::mem::replace(&mut self.is_numbered, false) {
+                tracing::error!("the daemon does not number its events: no events are sent; use the same version");
+            }
+            return (Vec::new(), 0);
+        }
+        let is_same_run = self.handled.is_some_and(|it| it.started == document.started && it.count <= total);
+        let handled = match self.handled {
+            Some(handled) if is_same_run => handled.count,
+            Some(_) => 0,
+            None => total - listed,
+        };
+        let missed = (total - listed).saturating_sub(handled);
+        let time = document.time.nanos();
+        let mut events = Vec::new();
+        if self.handled.is_some() && !is_same_run {
+            events.push(json!({ "event": "daemon_restarted", "time": time }));
+        }
+        if missed > 0 {
+            events.push(json!({ "event": "events_missed", "time": time, "severity": "warning", "missed": missed }));
+        }
+        let known = usize::try_from(handled.saturating_sub(total - listed)).unwrap_or(usize::MAX);
+        events.extend(document.events.iter().skip(known).cloned());
+        (events, missed)
     }
 
     /// Logs the first drop. Logs again only after a document whose messages caused no drop.
@@ -113,16 +154,6 @@ impl<'a> Recorder<'a> {
             (false, false) => None,
         }
     }
-}
-
-/// Returns the events of `now` that `before` does not list. The list `now` begins with the end of `before`, because the
-/// daemon drops its oldest events.
-fn new_events<'a>(before: &[Value], now: &'a [Value]) -> &'a [Value] {
-    let kept = (0..=before.len()).find_map(|dropped| {
-        let end = &before[dropped..];
-        now.starts_with(end).then_some(end.len())
-    });
-    &now[kept.unwrap_or(0)..]
 }
 
 #[cfg(test)]

@@ -8,7 +8,6 @@ use ratatui::widgets::{Block, Paragraph, Sparkline};
 use serde_json::Value;
 
 use super::app::{App, MAPPED, Page};
-use super::event_words;
 use super::plot::{ValueRange, bar, sparkline};
 use super::theme::{Theme, clock};
 use crate::cli::common::alarms::{AlarmGroup, grouped};
@@ -17,6 +16,7 @@ use crate::cli::status::{duration, mean, number, screen_unit, with_std, word};
 use crate::quantity::Timestamp;
 use crate::quantity::catalogue::Quantity;
 use crate::status::document::StatusDocument;
+use crate::status::event_words;
 
 /// Width of the cell number at the start of a map row.
 const LABEL: usize = 5;
@@ -281,7 +281,6 @@ fn events(document: &StatusDocument) -> Vec<Line<'static>> {
 }
 
 fn event_line(event: &Value, document: &StatusDocument) -> String {
-    let Value::Object(keys) = event else { return event.to_string() };
-    let time = keys.get("time").and_then(Value::as_i64).map(Timestamp::from_nanos);
-    format!("{} {}", time.map_or_else(|| "?".to_owned(), clock), event_words::words(keys, document))
+    let time = event.get("time").and_then(Value::as_i64).map(Timestamp::from_nanos);
+    format!("{} {}", time.map_or_else(|| "?".to_owned(), clock), event_words::words(event, document))
 }

@@ -218,6 +218,13 @@ impl Node {
         }
     }
 
+    /// Skips a cyclic DM1 that is due.
+    pub(crate) fn skip_cyclic(&mut self, now: Timestamp) {
+        if self.next_dm1 <= now {
+            self.next_dm1 = now.plus_nanos(DM1_PERIOD_NS);
+        }
+    }
+
     fn poll_dm1(&mut self, now: Timestamp, out: &mut NodeOutputs) {
         let is_cyclic = self.next_dm1 <= now;
         let has_changed = self.codes.change_due().is_some_and(|due| due <= now);

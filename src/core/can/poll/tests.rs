@@ -118,13 +118,14 @@ fn requests_keep_period_and_responses_get_flow_control() {
     bench.run(6050);
     let of = |id: u16| bench.requests().iter().filter(|(_, other)| *other == id).map(|(ms, _)| *ms).collect::<Vec<_>>();
     assert_eq!(of(1), [100, 1100, 2100, 3100, 4100, 5100], "periodic from the first frame on");
-    assert_eq!(of(2), [200, 3200], "after the other request, at ten requests a second");
+    assert_eq!(of(2), [300, 3300], "after the other request and its flow control, at ten frames a second");
     assert_eq!(bench.sent[..2], [(100, vec![3, 0x22, 0, 1, 0, 0, 0, 0]), (100, vec![0x30, 0, 0, 0, 0, 0, 0, 0])]);
 }
 
 #[test]
 fn polling_pauses_one_minute_after_other_tester() {
-    for foreign in [REQUEST, CanId::Standard(0x7DF), CanId::Standard(0x7E0), CanId::Extended(0x18DA_10F1)] {
+    let standard = [0x7DF, 0x7E0, 0x6F1, 0x710, 0x743].map(CanId::Standard);
+    for foreign in [REQUEST, CanId::Extended(0x18DA_10F1), CanId::Extended(0x17FC_007B)].into_iter().chain(standard) {
         let mut bench = Bench::new(vec![request(1, 0.5)]);
         bench.run(2000);
         bench.hear(foreign, &[2, 0x3E, 0, 0, 0, 0, 0, 0]);
@@ -136,6 +137,20 @@ fn polling_pauses_one_minute_after_other_tester() {
         let reason = PollSilence::OtherTester;
         assert_eq!(bench.changes[1..], [(2000, PollChange::Silent { reason }), (62_000, PollChange::Asking)]);
     }
+}
+
+#[test]
+fn endless_first_frames_get_one_flow_control_per_request() {
+    let mut bench =
+        Bench::with(PollConfig { requests: vec![request(1, 0.1)], max_requests_per_s: 5.0, watches_supply: false });
+    bench.answer = |_| Behaviour::Nothing;
+    for _ in 0..12_000 {
+        bench.run(1);
+        bench.poller.handle_begun(at(bench.now_ms), &CONTROLLER, &mut bench.out);
+        bench.take();
+    }
+    let (sent, requests) = (bench.sent.len(), bench.requests().len());
+    assert!(requests > 1 && sent <= 2 * requests && sent <= 60, "{sent} frames for {requests} requests in 12 s");
 }
 
 #[test]
@@ -196,6 +211,47 @@ fn standby_stops_polling() {
     bench.poller.set_standby(false);
     bench.run(1000);
     assert!(!bench.requests().is_empty());
+}
+
+/// A poller after a restart at `at_ms` from the progress of `bench`, in a moving car with an awake bus.
+fn restarted(bench: &Bench, at_ms: i64) -> Bench {
+    let mut stored = bench.poller.progress().clone();
+    let taken = at(bench.now_ms);
+    let mut next = Bench::new(vec![request(1, 0.5)]);
+    next.now_ms = at_ms;
+    if stored.restart(taken) {
+        stored.rebase(at(at_ms).nanos() - taken.nanos());
+        next.poller.restore_silence(&stored, at(at_ms), at(at_ms));
+    }
+    next
+}
+
+#[test]
+fn standby_and_silence_after_tester_survive_restart() {
+    let mut bench = Bench::new(vec![request(1, 0.5)]);
+    bench.run(2000);
+    let mut next = restarted(&bench, 0);
+    next.run(1000);
+    assert!(!next.requests().is_empty(), "neither standby nor a tester");
+    bench.poller.set_standby(true);
+    let mut next = restarted(&bench, 5000);
+    next.run(100_000);
+    assert_eq!(next.requests(), []);
+    next.poller.set_standby(false);
+    next.run(1000);
+    assert!(!next.requests().is_empty());
+    bench.poller.set_standby(false);
+    bench.hear(CanId::Standard(0x7DF), &[2, 0x3E, 0, 0, 0, 0, 0, 0]);
+    bench.run(50_000);
+    for at_ms in [0, 500_000] {
+        let mut next = restarted(&bench, at_ms);
+        next.run(59_999);
+        assert_eq!(next.requests(), [], "{at_ms}");
+        next.run(1000);
+        assert!(!next.requests().is_empty(), "{at_ms}");
+    }
+    bench.run(20_000);
+    assert!(!bench.poller.progress().clone().restart(at(bench.now_ms)), "nothing is left to store");
 }
 
 #[test]
@@ -295,7 +351,8 @@ proptest! {
             bench.take();
             prop_assert!(bench.poller.next_due().is_none_or(|due| due > at(bench.now_ms)), "{:?}", bench.poller);
         }
-        let requests = bench.requests();
+        let (requests, sent) = (bench.requests(), bench.sent.len());
+        prop_assert!(sent <= 2 * requests.len() && i64::try_from(sent).unwrap() <= 2 + bench.now_ms / 100, "{sent} frames");
         prop_assert!(requests.windows(2).all(|pair| pair[1].0 - pair[0].0 >= 100), "{requests:?}");
     }
 }

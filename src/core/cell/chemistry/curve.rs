@@ -182,6 +182,12 @@ impl CurvePrior {
     }
 }
 
+/// Inverse of a curve's covariance, to which a roughness of 2 mV is added; `None` if the sum is not positive definite.
+pub fn information(covariance_v2: &DMatrix<f64>) -> Option<DMatrix<f64>> {
+    let own = DMatrix::from_diagonal_element(covariance_v2.nrows(), covariance_v2.nrows(), 0.002 * 0.002);
+    Some((covariance_v2 + own).cholesky()?.inverse())
+}
+
 /// The cell made of a pair of materials, with these lithium contents (of the negative electrode in the full cell, of
 /// the positive electrode in the empty cell) and these cut-off voltages; `None` if such a cell does not exist.
 fn possible_cell(

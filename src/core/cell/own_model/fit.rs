@@ -159,10 +159,9 @@ impl<'a> Search<'a> {
     fn new(prior: &'a LabelPrior, rows: &'a [Row]) -> Option<(Self, DVector<f64>)> {
         let rated_ah = prior.label.rated_ah;
         let basis = Basis::new(prior, rows);
-        let prior = prior::information(basis.curve, rated_ah, basis.size())?;
+        let prior = prior::information(prior, basis.size())?;
         let start = basis.parameters(None);
-        let mut expected = DVector::zeros(basis.size());
-        expected[LOG_CAPACITY] = start[LOG_CAPACITY];
+        let mut expected = start.clone();
         (BEGINNINGS..basis.size()).for_each(|k| expected[k] = 0.5);
         Some((Self { basis, prior, expected, rated_ah }, start))
     }

@@ -7,12 +7,14 @@
 use super::fit::{self, Fit};
 use super::{OwnModel, rows_cost};
 use crate::cell::chemistry::{Chemistry, Label, LabelPrior};
+use crate::cell::fleet_prior::FleetPrior;
 use crate::cell::notebook::{Notebook, Row};
 
 /// Inputs of a fit.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FitTask {
     label: Label,
+    fleet: Option<FleetPrior>,
     rows: Vec<Row>,
     /// Number of rows, at the end of `rows`, that no fit has used yet.
     new_rows: usize,
@@ -37,9 +39,21 @@ pub struct FitFindings {
 
 impl FitTask {
     /// Creates a task from the rows of a notebook, the present model and the previous model.
-    pub fn new(label: Label, notebook: &Notebook, own: Option<&OwnModel>, before: Option<&OwnModel>) -> Self {
+    pub fn new(
+        (label, fleet): (Label, Option<&FleetPrior>),
+        notebook: &Notebook,
+        own: Option<&OwnModel>,
+        before: Option<&OwnModel>,
+    ) -> Self {
         let new_rows = notebook.new_rows().len();
-        Self { label, rows: notebook.rows().to_vec(), new_rows, own: own.cloned(), before: before.cloned() }
+        Self {
+            label,
+            fleet: fleet.cloned(),
+            rows: notebook.rows().to_vec(),
+            new_rows,
+            own: own.cloned(),
+            before: before.cloned(),
+        }
     }
 
     /// Runs the fit.
@@ -47,6 +61,7 @@ impl FitTask {
         let is_enough = fit::says_enough(&self.label, &self.rows);
         let nothing = FitFindings { is_before_better: false, is_enough, fit: None, chemistry: None };
         let Some(prior) = self.label.prior() else { return nothing };
+        let prior = LabelPrior { fleet: self.fleet.clone(), ..prior };
         let fit = fit::fit(&prior, &self.rows);
         let chemistry = if is_enough { self.better_chemistry(&prior, fit.as_ref()) } else { None };
         FitFindings { is_before_better: self.is_before_better(&prior), fit, chemistry, ..nothing }

@@ -1,7 +1,7 @@
 //! Events of the [`Monitor`](crate::monitor::Monitor), which the driver logs and the history records.
 
 use serde::{Deserialize, Serialize};
-use strum::IntoStaticStr;
+use strum::{IntoStaticStr, VariantNames};
 
 use super::command::{Command, Source};
 use super::record::BusEvent;
@@ -21,7 +21,7 @@ use crate::quantity::catalogue::RecordedValues;
 use crate::quantity::{BusIndex, CellIndex, Fault, Mode, Timestamp};
 
 /// Kind of an event, with its data.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, IntoStaticStr)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, IntoStaticStr, VariantNames)]
 #[serde(rename_all = "snake_case", tag = "event")]
 #[strum(serialize_all = "snake_case")]
 pub enum EventKind {
@@ -305,6 +305,11 @@ impl EventKind {
     /// Name of the event in event files, summaries and on the screen.
     pub fn name(&self) -> &'static str {
         self.into()
+    }
+
+    /// Names of all kinds.
+    pub fn names() -> &'static [&'static str] {
+        Self::VARIANTS
     }
 }
 

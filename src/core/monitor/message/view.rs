@@ -5,6 +5,7 @@ use serde::{Deserialize, Serialize};
 use super::event::ModelState;
 use super::outputs::Validity;
 use crate::cell::Chemistry;
+use crate::monitor::stage::learning::moved::MovedSums;
 use crate::quantity::catalogue::{CellValues, PackValues};
 use crate::quantity::{CellIndex, Mode};
 
@@ -48,6 +49,9 @@ pub struct PackView {
     /// The chemistry that explains the voltages better than the label's chemistry.
     #[serde(default)]
     pub model_fits_better: Option<Chemistry>,
+    /// Charge and energy moved while the program ran with this pack; `None` in documents of earlier versions.
+    #[serde(default)]
+    pub moved: Option<MovedSums>,
     /// Values of the pack.
     #[serde(flatten)]
     pub values: PackValues,

@@ -11,8 +11,10 @@
 use serde::{Deserialize, Serialize};
 
 pub(crate) mod life;
+pub(crate) mod moved;
 
 use life::PackLife;
+use moved::MovedCounter;
 
 use super::estimation::resistance;
 use super::publisher::{Publisher, learned};
@@ -59,7 +61,10 @@ pub(crate) struct LearningState {
     pub(crate) recharge: RechargeTimer,
     pub(crate) recharge_period_s: Option<f64>,
     pub(crate) normalised_recharge: Option<ScalarGaussian>,
+    #[serde(default)]
     pub(crate) load: RecentLoad,
+    #[serde(default)]
+    pub(crate) moved: MovedCounter,
     pub(crate) pack: Option<PackState>,
 }
 
@@ -138,6 +143,7 @@ impl LearningState {
             learner: self.learner.learned_only(),
             recharge_period_s: self.recharge_period_s,
             normalised_recharge: self.normalised_recharge,
+            moved: self.moved.interrupted(),
             ..Self::default()
         }
     }
@@ -151,6 +157,7 @@ impl LearningState {
         }
         self.recharge.rebase(by_nanos);
         self.load.rebase(by_nanos);
+        self.moved.rebase(by_nanos);
     }
 }
 
@@ -159,6 +166,7 @@ impl LearningState {
         self.learner.check()?;
         self.recharge.check()?;
         self.load.check()?;
+        self.moved.check()?;
         self.pack.iter().try_for_each(PackState::check)?;
         bounds::TIME_S.check_all("the recharge period", self.recharge_period_s)?;
         check_positive("the normalised recharge period", self.normalised_recharge)

@@ -17,8 +17,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::cell::own_model::task::{FitFindings, FitTask};
 use crate::cell::{
-    AdoptedState, CellModel, CellStep, Chemistry, EstimatorConfig, InitialState, Label, Notebook, NotebookConfig,
-    OwnModel,
+    AdoptedState, CellModel, CellStep, Chemistry, EstimatorConfig, FleetPrior, InitialState, Label, Notebook,
+    NotebookConfig, OwnModel,
 };
 use crate::filter::ScalarGaussian;
 use crate::monitor::config::MonitorConfig;
@@ -74,6 +74,8 @@ pub struct ModelView<'a> {
     pub state: ModelState,
     /// The label; `None` = a model file is used.
     pub label: Option<Label>,
+    /// What other vehicles have learned about cells of this label.
+    pub fleet: Option<&'a FleetPrior>,
     /// The learned model; `None` while the label's model or a model file is used.
     pub own: Option<&'a OwnModel>,
     /// Rows from which the model is learned.
@@ -92,7 +94,8 @@ pub struct ModelView<'a> {
 #[derive(Debug)]
 pub(crate) struct Modelling {
     label: Option<Label>,
-    /// The configured model, from the label.
+    fleet: Option<FleetPrior>,
+    /// The configured model, from the label or from the fleet.
     model: CellModel,
     estimator: EstimatorConfig,
     notebook: NotebookConfig,
@@ -180,6 +183,7 @@ impl ModellingState {
         ModelView {
             state,
             label,
+            fleet: None,
             own: own.as_ref(),
             notebook: label.map(|_| notebook),
             chemistry: *chemistry,
@@ -206,6 +210,7 @@ impl Modelling {
         let rated_ah = config.label.map_or(config.model.rated_capacity_ah, |label| label.rated_ah);
         Self {
             label: config.label,
+            fleet: config.fleet.clone(),
             model: config.model.clone(),
             estimator: config.estimator,
             notebook: NotebookConfig::new(config.own_cells(), rated_ah),
@@ -219,6 +224,7 @@ impl Modelling {
     /// Applies the settings of a new configuration that has the same cells.
     pub(crate) fn reconfigure(&mut self, config: &MonitorConfig) {
         (self.model, self.estimator) = (config.model.clone(), config.estimator);
+        self.fleet.clone_from(&config.fleet);
     }
 
     /// Forgets the learned model, because another pack is connected.
@@ -299,7 +305,7 @@ impl Modelling {
 
     fn task(&self) -> Option<FitTask> {
         let ModellingState { notebook, own, before, .. } = &self.state;
-        Some(FitTask::new(self.label?, notebook, own.as_ref(), before.as_ref()))
+        Some(FitTask::new((self.label?, self.fleet.as_ref()), notebook, own.as_ref(), before.as_ref()))
     }
 
     /// Whether the label's model is used, because no model was given and none has been learned.
@@ -414,7 +420,7 @@ impl Modelling {
 
     /// View of the cells' model.
     pub(crate) fn view(&self) -> ModelView<'_> {
-        self.state.view(self.label)
+        ModelView { fleet: self.fleet.as_ref(), ..self.state.view(self.label) }
     }
 
     /// Ends the present rest, the fit in progress, and the notebook's stretch of contiguous rows.

@@ -136,6 +136,19 @@ impl Sampling {
         self.report(now, out);
     }
 
+    /// Sum of the cells' voltages (V); `None` unless all cell voltages are fresh.
+    pub(crate) fn pack_voltage_v(&self, mut cells: impl Iterator<Item = CellIndex>, now: Timestamp) -> Option<f64> {
+        let sum_v = cells.try_fold(0.0, |sum_v, cell| {
+            let channel = self.voltage_channel(cell);
+            let voltage_v = self.sampler.reported(channel, now).filter(|_| self.sampler.is_fresh(channel, now))?;
+            Some(sum_v + voltage_v)
+        })?;
+        Some(match self.sampler.config().voltage_source {
+            VoltageSource::Cells => sum_v,
+            VoltageSource::PackTotal { series } => sum_v * f64::from(series),
+        })
+    }
+
     /// The channel of a cell's voltage.
     pub(crate) fn voltage_channel(&self, cell: CellIndex) -> Channel {
         match self.sampler.config().voltage_source {

@@ -34,9 +34,10 @@ pub const MAX_TEST_S: f64 = 600.0;
 const REPLY_BURST: i64 = 5;
 const REPLY_DELAY_NS: i64 = REPLY_DELAY_MS as i64 * 1_000_000;
 
-/// Number of freshness values skipped at a start. An earlier process may have sent frames after its state was stored.
-/// The skipped values suffice for more than an hour of such frames at the highest rate.
-const RESTART_FRESHNESS: u64 = 1 << 20;
+/// Number of freshness values skipped at a start. An earlier process may have sent this many frames after its state was
+/// stored: the driver stores the state before the first frame and after every half of these values. The value is so
+/// small that 300 starts a day do not overtake [`FRESHNESS_PER_S`].
+pub const RESTART_FRESHNESS: u64 = 1 << 16;
 /// At a start, the freshness is at least this value times the clock's time in seconds. The value exceeds the number of
 /// frames in a second.
 const FRESHNESS_PER_S: u64 = 256;
@@ -68,9 +69,17 @@ pub(crate) struct SendingState {
 }
 
 impl SendingState {
-    /// Drops everything that ends with the process: a test, diagnostic requests and the J1939 address.
-    pub(crate) fn restart(&mut self) {
-        (self.test, self.poller, self.node) = (None, None, None);
+    /// Drops everything that ends with the process: a test, diagnostic requests and the J1939 address. Standby and the
+    /// silence after another tester remain.
+    pub(crate) fn restart(&mut self, now: Timestamp) {
+        (self.test, self.node) = (None, None);
+        self.poller.take_if(|poller| !poller.restart(now));
+    }
+
+    /// Shifts stored times to another clock.
+    pub(crate) fn rebase(&mut self, by_nanos: i64) {
+        self.schedule.rebase(by_nanos);
+        self.poller.iter_mut().for_each(|poller| poller.rebase(by_nanos));
     }
 }
 
@@ -103,6 +112,12 @@ pub(crate) struct Schedule {
     freshness: Timestamp,
     /// Freshness of the last authenticated frame; all messages share one sequence.
     sent_freshness: u64,
+    /// Whether cyclic frames are omitted, because the buses sleep.
+    #[serde(default)]
+    is_quiet: bool,
+    /// Time before which a sleep omits no frames. After a restart, the program first has to hear the silence itself.
+    #[serde(default)]
+    quiet_from: Timestamp,
 }
 
 impl Schedule {
@@ -174,6 +189,13 @@ impl Sending {
         }
     }
 
+    /// Restores what remains of the diagnostic requests after a restart. `taken`: time of the stored state.
+    pub(crate) fn restore_silence(&mut self, state: &SendingState, taken: Timestamp, now: Timestamp) {
+        if let (Some(poller), Some(stored)) = (&mut self.poller, &state.poller) {
+            poller.restore_silence(stored, taken, now);
+        }
+    }
+
     /// Resumes a test, diagnostic requests and the J1939 node from a stored state. The caller has already restored the
     /// schedule.
     pub(crate) fn resume(&mut self, state: &SendingState) {
@@ -232,8 +254,20 @@ impl Sending {
         self.schedule.housekeeping = self.schedule.housekeeping.min(now);
     }
 
+    /// Omits cyclic frames while the buses sleep, unless they are configured.
+    pub(crate) fn set_asleep(&mut self, now: Timestamp, is_asleep: bool) {
+        let is_asleep = is_asleep && now >= self.schedule.quiet_from;
+        self.schedule.is_quiet = is_asleep && self.config.as_ref().is_none_or(|config| !config.while_asleep);
+    }
+
+    /// After a restart: a sleep that the program has not seen yet omits no frames before `time`.
+    pub(crate) fn set_quiet_from(&mut self, time: Timestamp) {
+        self.schedule.quiet_from = time;
+    }
+
     /// Makes all cyclic work due now. Called after a start, a sleep, and a gap.
     pub(crate) fn restart(&mut self, now: Timestamp) {
+        self.is_rescheduled = true;
         self.schedule.dues().into_iter().for_each(|due| *due = now);
         self.schedule.reply = self.schedule.reply.min(now);
         self.schedule.alarms.restart(now);
@@ -245,6 +279,11 @@ impl Sending {
         let by_clock = u64::try_from(now.nanos() / 1_000_000_000).unwrap_or(0).saturating_mul(FRESHNESS_PER_S);
         let sent = &mut self.schedule.sent_freshness;
         *sent = sent.saturating_add(RESTART_FRESHNESS).max(by_clock);
+    }
+
+    /// Freshness of the last authenticated frame.
+    pub(crate) fn sent_freshness(&self) -> u64 {
+        self.schedule.sent_freshness
     }
 
     /// Skips the counters of all frames that an earlier process sent after its state was stored, or would have sent by
@@ -303,19 +342,21 @@ impl Sending {
     /// Whether the status, health and alarm frames and the digest are due; `None` without `[output]`.
     pub(crate) fn take_frames_due(&mut self, now: Timestamp) -> Option<[bool; 4]> {
         let (config, schedule) = (self.config.as_ref()?, &mut self.schedule);
-        Some([
+        let due = [
             take_due(&mut schedule.status, now, config.status_period_s),
             take_due(&mut schedule.health, now, config.health_period_s),
             take_due(&mut schedule.alarm, now, config.alarm_period_s),
             take_due(&mut schedule.digest, now, config.digest_period_s),
-        ])
+        ];
+        Some(due.map(|is_due| is_due && !self.schedule.is_quiet))
     }
 
     /// Whether the frame that announces the freshness for commands is due.
     pub(crate) fn take_freshness_due(&mut self, now: Timestamp) -> bool {
         let is_sent = |config: &OutputConfig| config.plan.authentication(LayoutMessage::Freshness).is_some();
         let due = &mut self.schedule.freshness;
-        self.config.as_ref().is_some_and(is_sent) && take_due(due, now, f64::from(FRESHNESS_PERIOD_MS) / 1000.0)
+        let period_s = f64::from(FRESHNESS_PERIOD_MS) / 1000.0;
+        self.config.as_ref().is_some_and(is_sent) && take_due(due, now, period_s) && !self.schedule.is_quiet
     }
 
     /// Announces the freshness that commands may use next. `bus`: interface on which commands are received.
@@ -355,6 +396,9 @@ impl Sending {
     /// Sends the due alarms within the budget.
     pub(crate) fn send_due_alarms(&mut self, now: Timestamp, engine: &AlarmEngine, out: &mut Outputs) {
         let Some(period_s) = self.config.as_ref().map(|config| config.alarm_period_s) else { return };
+        if self.schedule.is_quiet {
+            self.schedule.alarms.skip_turns(now, engine, period_s);
+        }
         // The loop ends when the budget is used up.
         while let Some(key) = self.schedule.alarms.take(now, engine, period_s) {
             self.send_key(now, key, engine, out);
@@ -563,6 +607,9 @@ impl Sending {
     /// Sends the due frames of the J1939 node.
     pub(crate) fn poll_j1939(&mut self, now: Timestamp, out: &mut Outputs) {
         if let Some(j1939) = &mut self.j1939 {
+            if self.schedule.is_quiet {
+                j1939.node.skip_cyclic(now);
+            }
             j1939.poll(now, out);
         }
     }

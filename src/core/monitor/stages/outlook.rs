@@ -2,8 +2,9 @@
 //! view.
 
 use super::Stages;
-use crate::filter::ScalarGaussian;
-use crate::health::outlook::{CellState, Outlook, Structure, energy_health, of_pack};
+use crate::cell::{ModelBands, arrhenius};
+use crate::filter::{ScalarGaussian, square};
+use crate::health::outlook::{CellNow, Outlook, Structure, energy_health, of_pack};
 use crate::sample::VoltageSource;
 
 impl Stages {
@@ -29,17 +30,24 @@ impl Stages {
     }
 
     /// State from which the outlook of a cell is computed; `None` before its first estimate, or without a temperature.
-    pub(crate) fn cell_state(&self, index: usize) -> Option<CellState<'_>> {
+    pub(crate) fn cell_state(&self, index: usize) -> Option<CellNow<'_>> {
         let bank = &self.estimation.bank;
-        let estimator = bank.cell(index);
-        Some(CellState {
+        let (soc, temperature_c, estimator) = (bank.soc(index)?, bank.temperature_c(index)?, bank.cell(index));
+        // The filter learns one ratio for all SOC and temperatures; the model's error at this point remains.
+        let local = ModelBands::new(bank.model(index)).resistance(soc.mean, temperature_c).local;
+        let of_cell = estimator.log_resistance();
+        // Outside of its table, the model has the resistance of the nearest temperature.
+        let temperatures_c = &bank.model(index).temperature_c;
+        let nearest_c = temperature_c.max(temperatures_c[0]).min(temperatures_c[temperatures_c.len() - 1]);
+        let outside = libm::log(arrhenius(temperature_c) / arrhenius(nearest_c));
+        Some(CellNow {
             model: bank.model(index),
-            soc: bank.soc(index)?,
+            soc,
             capacity: self.learning.capacity(index),
-            log_resistance: estimator.log_resistance(),
+            log_resistance: ScalarGaussian { variance: of_cell.variance + square(local) + square(outside), ..of_cell },
             slow_ratio: estimator.slow_ratio(bank.config(index)).mean,
             branch_v: estimator.branch_v(),
-            temperature_c: bank.temperature_c(index)?,
+            temperature_c,
         })
     }
 }

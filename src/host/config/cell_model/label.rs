@@ -2,7 +2,7 @@
 //! On board, learning then improves this model.
 
 use super::source::{LearnedFrom, MeasuredRange, ModelSource, SourcedModel};
-use crate::cell::{Coverage, Label};
+use crate::cell::{Coverage, FleetPrior, Label};
 use crate::monitor::{ModelState, ModelView};
 
 /// Returns the model made from a cell's label; `None` = the voltages are not plausible for the chemistry.
@@ -17,10 +17,18 @@ pub fn of_label(label: &Label) -> Option<SourcedModel> {
     label.model().map(|model| SourcedModel { model, source })
 }
 
+/// Returns the model with which a vehicle of a fleet starts; `None` = the voltages are not plausible for the chemistry.
+pub fn of_fleet(prior: &FleetPrior) -> Option<SourcedModel> {
+    let SourcedModel { source, .. } = of_label(&prior.label)?;
+    let origin = format!("learned by {} other vehicles with cells of this label", prior.vehicles);
+    let provenance = toml::Table::from_iter([("source".to_owned(), origin.into())]);
+    Some(SourcedModel { model: prior.cell_model()?, source: ModelSource { provenance, ..source } })
+}
+
 /// Returns the present model of a pack that learns its model on board; `None` = the pack's model comes from a file.
 pub fn of_view(view: &ModelView<'_>) -> Option<SourcedModel> {
     let label = view.label?;
-    let SourcedModel { model: prior, source } = of_label(&label)?;
+    let SourcedModel { model: prior, source } = view.fleet.map_or_else(|| of_label(&label), of_fleet)?;
     let learned = LearnedFrom {
         seen: Coverage::of_rows(view.notebook.map_or(&[], |notebook| notebook.rows())),
         residual_v: view.own.map(|own| own.residual_v),
@@ -30,9 +38,11 @@ pub fn of_view(view: &ModelView<'_>) -> Option<SourcedModel> {
         prior: Box::new(prior.clone()),
     };
     let own = view.own.and_then(|own| Some(own.cell_model(&label)?.rebased(own.capacity.mean)));
-    let origin = match &own {
-        Some(_) => "learned on board from the vehicle's own data, starting from the label",
-        None => "chemistry prior of the label",
+    let origin = match (&own, view.fleet) {
+        (Some(_), None) => "learned on board from the vehicle's own data, starting from the label",
+        (Some(_), Some(_)) => "learned on board from the vehicle's own data, starting from a fleet's prior",
+        (None, None) => "chemistry prior of the label",
+        (None, Some(_)) => "prior of a fleet",
     };
     let provenance = toml::Table::from_iter([("source".to_owned(), origin.into())]);
     let measured = own.as_ref().map_or_else(MeasuredRange::default, |_| seen_range(&learned.seen));

@@ -6,7 +6,7 @@
 
 use std::path::Path;
 
-use crate::cell::{CellModel, Chemistry, Label};
+use crate::cell::{CellModel, Chemistry, FleetPrior, Label};
 use crate::config::cell_model::{self, SourcedModel};
 use crate::config::document::{Document, Faults, ReadFile, TablePlace, beside, meant_file};
 use crate::config::schema::RawTables;
@@ -50,6 +50,9 @@ pub(crate) fn own_model(
     let pack = raw.pack.as_ref()?;
     check_label(&pack.place, pack.chemistry, pack.rated_capacity_ah)?;
     let label = label(pack)?;
+    if pack.prior.is_some() {
+        return cell_model::of_fleet(&fleet_prior(path, pack, read)?);
+    }
     let model = cell_model::of_label(&label);
     if model.is_none() {
         let Label { chemistry, voltage_min_v, voltage_max_v, rated_ah, .. } = label;
@@ -63,6 +66,32 @@ pub(crate) fn own_model(
         pack.place.fault("chemistry", what);
     }
     model
+}
+
+/// What other vehicles have learned about the pack's own cells, from the file `pack.prior`.
+pub(crate) fn fleet_prior(path: &Path, pack: &Pack, read: ReadFile<'_>) -> Option<FleetPrior> {
+    let (named, label) = (pack.prior.as_ref()?, label(pack)?);
+    let file = beside(path, named);
+    let parsed = read(&file).map_err(|error| error.to_string()).and_then(|bytes| {
+        let text = String::from_utf8(bytes).map_err(|error| error.to_string())?;
+        let table: toml::Table = text.parse().map_err(|error: toml::de::Error| error.message().to_owned())?;
+        // The program reads stored models from JSON; a second reader would make it larger.
+        let json = serde_json::to_vec(&table).map_err(|error| error.to_string())?;
+        let prior: FleetPrior = serde_json::from_slice(&json).map_err(|error| error.to_string())?;
+        prior.check().map_err(|error| error.to_string())?;
+        Ok(prior)
+    });
+    match parsed {
+        Ok(prior) if prior.label == label => return Some(prior),
+        Ok(prior) => {
+            pack.place.fault("prior", format!("is for {}, must be for the cells of [pack]: {label}", prior.label))
+        }
+        Err(error) => {
+            let what = format!("must be a file of `packwatch fleet prior`: {}: {error}", file.display());
+            pack.place.fault("prior", what);
+        }
+    }
+    None
 }
 
 /// The model in the file `named`. If the file cannot be used at all, `fault` reports this at the key that names the
@@ -103,7 +132,7 @@ fn check_label(place: &TablePlace, chemistry: Option<Chemistry>, rated_ah: Optio
 /// Reports label keys that are given together with a model file, because the file states the same values. Returns
 /// whether any such key is given.
 fn check_file(place: &TablePlace, cell_model: Option<&String>) -> bool {
-    let of_label = ["chemistry", "voltage_min_v", "voltage_max_v"].into_iter();
+    let of_label = ["chemistry", "prior", "voltage_min_v", "voltage_max_v"].into_iter();
     let given: Vec<&str> = of_label.filter(|key| cell_model.is_some() && place.has(key)).collect();
     for key in &given {
         place.fault(key, "must not be given together with cell_model, which states it");

@@ -195,6 +195,20 @@ fn health(raw: &RawTables, model: Option<&CellModel>) {
             estimator.place.fault("capacity_state", format!("must be \"{needed}\" with capacity.method = \"{key}\""));
         }
     }
+    // If the model's own range is invalid, only the model's fault is reported.
+    let has_range = |model: &&CellModel| model.voltage_min_v < model.voltage_max_v;
+    if let (Some(outlook), Some(model)) = (&raw.outlook, model.filter(has_range)) {
+        let min_v = outlook.min_voltage_v.unwrap_or(model.voltage_min_v);
+        let [low_v, high_v] = [0.5 * model.voltage_min_v, model.voltage_max_v + 0.5];
+        if !(low_v..model.voltage_max_v).contains(&min_v) {
+            let what =
+                format!("must be from {low_v} to below the cell model's voltage_max_v = {}", model.voltage_max_v);
+            outlook.place.fault("min_voltage_v", &what);
+        }
+        if outlook.max_voltage_v.is_some_and(|max_v| max_v <= min_v || max_v > high_v) {
+            outlook.place.fault("max_voltage_v", format!("must be above {min_v}, the lowest voltage, to {high_v}"));
+        }
+    }
     if let (Some(usable), Some(model)) = (&raw.usable, model)
         && usable.cutoff_v >= model.voltage_max_v
     {

@@ -3,6 +3,8 @@
 //! In: the document, because a faulty table is not in [`RawTables`] but must still be checked, so that every fault is
 //! reported at once.
 
+use std::collections::BTreeSet;
+
 use toml::de::{DeTable, DeValue};
 
 use super::signals::{self, Databases};
@@ -41,10 +43,10 @@ pub(crate) fn interfaces(document: &Document<'_>, raw: &RawTables) {
 
 /// Reports unknown signals in tables that have another fault.
 pub(crate) fn signals(document: &Document<'_>, raw: &RawTables, databases: &Databases) {
-    let read: Vec<&str> = raw.places().map(|place| place.path.as_str()).collect();
+    let read: BTreeSet<&str> = raw.places().map(|place| place.path.as_str()).collect();
     for (place, table) in with_key("signal").flat_map(|info| tables(document, info)) {
         let signal = table.get("signal").and_then(|value| value.get_ref().as_str());
-        let Some(signal) = signal.filter(|name| !name.contains('{') && !read.contains(&place.path.as_str())) else {
+        let Some(signal) = signal.filter(|name| !name.contains('{') && !read.contains(place.path.as_str())) else {
             continue;
         };
         let source =

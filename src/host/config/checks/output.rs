@@ -97,6 +97,7 @@ pub(crate) fn output(
         health_period_s: period_s(LayoutMessage::Health),
         alarm_period_s: period_s(LayoutMessage::Alarm),
         digest_period_s: period_s(LayoutMessage::Digest),
+        while_asleep: keys.while_asleep,
         plan,
         buses,
     };

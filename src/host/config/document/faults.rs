@@ -3,7 +3,7 @@
 //! A fault reads `FILE:LINE: KEY = FOUND, must be ALLOWED`. Checking continues after a fault, so all faults are found.
 
 use std::cell::RefCell;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::rc::Rc;
 
@@ -13,7 +13,7 @@ use std::rc::Rc;
 pub struct ConfigFaults(pub Vec<String>);
 
 /// A line of a file.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) struct SourceLine {
     /// File, as the user named it.
     pub file: String,
@@ -46,6 +46,17 @@ pub(crate) struct Faults(Rc<RefCell<Notes>>);
 struct Notes {
     faults: Vec<(SourceLine, String)>,
     warnings: Vec<(SourceLine, String)>,
+    /// All faults and warnings, to leave out repetitions.
+    noted: BTreeSet<(bool, SourceLine, String)>,
+}
+
+impl Notes {
+    fn note(&mut self, is_fault: bool, at: &SourceLine, text: impl fmt::Display) {
+        let (at, text) = (at.clone(), text.to_string());
+        if self.noted.insert((is_fault, at.clone(), text.clone())) {
+            if is_fault { &mut self.faults } else { &mut self.warnings }.push((at, text));
+        }
+    }
 }
 
 impl Faults {
@@ -56,12 +67,12 @@ impl Faults {
 
     /// Adds the fault `text` at a line.
     pub(crate) fn add_at(&self, at: &SourceLine, text: impl fmt::Display) {
-        note(&mut self.0.borrow_mut().faults, at, text);
+        self.0.borrow_mut().note(true, at, text);
     }
 
     /// Adds a warning about a value that is allowed but unlikely. The configuration remains valid.
     pub(crate) fn warn(&self, at: &SourceLine, text: impl fmt::Display) {
-        note(&mut self.0.borrow_mut().warnings, at, text);
+        self.0.borrow_mut().note(false, at, text);
     }
 
     /// Number of faults.
@@ -91,16 +102,13 @@ impl Faults {
     }
 }
 
-fn note(list: &mut Vec<(SourceLine, String)>, at: &SourceLine, text: impl fmt::Display) {
-    let note = (at.clone(), text.to_string());
-    if !list.contains(&note) {
-        list.push(note);
-    }
-}
-
 fn lines(list: &[(SourceLine, String)]) -> Vec<String> {
     let mut sorted: Vec<_> = list.iter().collect();
-    sorted.sort_by_key(|(at, _)| (list.iter().position(|(first, _)| first.file == at.file), at.line));
+    let mut firsts = BTreeMap::new();
+    for (place, (at, _)) in list.iter().enumerate() {
+        firsts.entry(&at.file).or_insert(place);
+    }
+    sorted.sort_by_key(|(at, _)| (firsts.get(&at.file), at.line));
     // A name in the file may contain a line break, but a fault must stay on one line.
     sorted.iter().map(|(at, text)| format!("{at}: {text}").replace('\n', "\\n")).collect()
 }

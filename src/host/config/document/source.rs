@@ -9,6 +9,7 @@ use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use super::faults::{ConfigFaults, Faults, SourceLine};
+use crate::bounded_file;
 use crate::config::schema::nearest;
 
 /// Largest number of drop-ins of one file. One per table is enough, and a file has about 40 tables.
@@ -83,6 +84,8 @@ pub(crate) struct SourceFile {
     /// The text, preceded by `start` blanks. Positions in this string are therefore positions in the sequence of all
     /// texts.
     placed: String,
+    /// Positions of the line breaks, so that a file with many tables is checked in linear time.
+    breaks: Vec<usize>,
 }
 
 impl SourceFile {
@@ -98,8 +101,7 @@ impl SourceFile {
 
     /// Line, from 1, on which `span` begins.
     pub(crate) fn line(&self, span: &Range<usize>) -> usize {
-        let before = self.placed.as_bytes().get(..span.start).unwrap_or(self.placed.as_bytes());
-        1 + before.iter().filter(|&&b| b == b'\n').count()
+        1 + self.breaks.partition_point(|at| *at < span.start)
     }
 }
 
@@ -126,7 +128,8 @@ impl Sources {
             let text = text.strip_prefix('\u{feff}').unwrap_or(&text);
             let placed = " ".repeat(start) + text;
             let end = placed.len();
-            files.push(SourceFile { name, start, placed });
+            let breaks = placed.match_indices('\n').map(|(at, _)| at).collect();
+            files.push(SourceFile { name, start, placed, breaks });
             start = end + 1;
         }
         Self { files }
@@ -194,7 +197,7 @@ pub(crate) fn meant_file(config: &Path, named: &str) -> String {
 }
 
 pub(crate) fn read_file(path: &Path) -> std::io::Result<Vec<u8>> {
-    std::fs::read(path)
+    bounded_file::read(path)
 }
 
 /// The file as UTF-8 text; `None` = the file cannot be read or is not UTF-8 (reported).

@@ -9,6 +9,27 @@ fn each_edit_gives(table: &[(&str, &str, &str)]) {
     }
 }
 
+/// With work that grows with the square of the number of tables, this takes minutes.
+#[test]
+fn many_tables_are_checked_in_seconds() {
+    let begun = std::time::Instant::now();
+    let diagnostic = |n: u32| {
+        format!(
+            "[[input.diagnostic]]\nname = \"D{n}\"\nrequest = 0x7E4\nresponse = 0x7EC\nservice = 0x22\nidentifier = {n}\n\
+             signals = [{{ name = \"S{n}\", bit = 0, length = 8, unit = \"V\" }}]\n"
+        )
+    };
+    let protected = |n: u32| format!("[[input.protected]]\nmessage = \"M{n}\"\nprofile = \"1A\"\ndata_id = 1\n");
+    let unknown = |n: u32| format!("[junk{n}]\nx = 1\n");
+    let makers: [&dyn Fn(u32) -> String; 3] = [&diagnostic, &protected, &unknown];
+    for make in makers {
+        let tables: String = (1..=10_000).map(make).collect();
+        let found = read_texts(&format!("{PACK}{tables}"), CELL, DBC).map_or_else(|faults| faults.len(), |_| 0);
+        let elapsed_s = begun.elapsed().as_secs_f64();
+        assert!(elapsed_s < 60.0, "{found} faults after {elapsed_s} s");
+    }
+}
+
 #[test]
 fn faults_state_file_line_key_found_and_allowed() {
     let table: &[(&str, &str, &str)] = &[

@@ -152,6 +152,23 @@ fn page_shows_what_the_document_says() {
     assert_eq!(browser.texts("img").len(), 0, "names are text");
     assert!(browser.ask(labels)[0].as_str().unwrap().ends_with("alarm or finding"));
 
+    // Damage in the page's own state: a document that it cannot read, a clock that was set back, a late document.
+    daemon.report(healthy());
+    browser.wait_for_headline(HEALTHY);
+    let mut head =
+        |change: &str| browser.ask(&format!("{change};verdict();document.getElementById('head').textContent"));
+    assert_eq!(head("doc.cells[3].trusted=null"), "Not known to be healthy: the state of cell 4 is not known");
+    let unknown = "Not known to be healthy: the state of the pack is not known: no complete measurement";
+    assert_eq!(head("doc.cells[3].trusted=true;doc.state='limited'"), unknown, "a state that the page does not know");
+    assert_eq!(head("doc.state='valid';doc.cells=[]"), unknown);
+    assert_eq!(head("doc.findings=[{kind:1}]"), "This page cannot read the state of the battery: reload it");
+    assert_eq!(head("heardAt[0]+=36e5"), "packwatch cannot be reached: nothing is known now");
+    browser.wait_for_headline(HEALTHY);
+    let mut head =
+        |change: &str| browser.ask(&format!("{change};verdict();document.getElementById('head').textContent"));
+    assert_eq!(head("isSlow=true"), "The connection is too slow: nothing is known now");
+    browser.wait_for_headline(HEALTHY);
+
     drop(daemon);
     browser.wait_for_headline(GONE);
     assert_eq!(browser.ask("document.body.classList.contains('old')"), true);

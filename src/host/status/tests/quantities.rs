@@ -7,7 +7,7 @@ use crate::quantity::catalogue::{CellValues, PackValues, Presentation, QuantityR
 
 const HEAD: &str = "# Quantities
 
-The quantities that packwatch publishes for the pack and for each cell. This page is generated from `src/core/quantity/catalogue.rs`.
+The quantities that packwatch publishes for the pack and for each cell. This page is generated from `src/core/quantity/catalogue/table.rs`.
 
 * If a quantity has two keys, the second key is its standard deviation. The metric and the MQTT key of a standard deviation end with
   `_std`, and its VSS signal ends with `StandardDeviation`.

@@ -9,7 +9,8 @@ use crate::control::protocol::UnknownAlarms;
 use crate::filter::ScalarGaussian;
 use crate::io::socket::{LinkCounts, LinkState};
 use crate::monitor::{
-    AlarmCounts, BusStatistics, CellView, LearningCounts, ModelState, PackView, Statistics, Validity, VoltageCounts,
+    AlarmCounts, BusStatistics, CellView, LearningCounts, ModelState, MovedSums, PackView, Statistics, Validity,
+    VoltageCounts,
 };
 use crate::quantity::catalogue::{CellValues, Estimate, PackValues, Quantity, Values};
 use crate::quantity::{CellIndex, Mode, Timestamp};
@@ -102,6 +103,7 @@ pub(crate) fn sample(cells: u16) -> StatusDocument {
             file_bytes: Some(65_536),
             ..StoreStatus::default()
         }),
+        event_count: 2,
         events: vec![
             serde_json::json!({ "time": time.nanos(), "event": "mode", "from": "rest", "to": "discharge" }),
             serde_json::json!({ "time": time.nanos(), "event": "trust", "cell": 2, "trusted": false, "mean_nis": 3.25 }),
@@ -155,6 +157,12 @@ fn pack(cells: u16) -> PackView {
         weakest_cell: Some(CellIndex(0)),
         shortest_lived_cell: Some(CellIndex(0)),
         power_limiting_cells: Some([CellIndex(0), CellIndex(0)]),
+        moved: Some(MovedSums {
+            charged_ah: 1210.5,
+            discharged_ah: 1180.25,
+            charged_wh: 424_000.0,
+            discharged_wh: 406_000.0,
+        }),
         values: with_life(values, 0.061, 412.3),
     }
 }

@@ -3,7 +3,7 @@
 //!
 //! Input: folders written by [`run`](crate::fleet::vehicles::run). Output: `vehicles.parquet` with a row for each
 //! vehicle, including vehicles that failed; `half_cycles.parquet`; `alarms.parquet`; and, if estimates were exported,
-//! `estimates.parquet`. The bytes do not depend on which machine replayed a vehicle or on the order of the replays.
+//! `estimates.parquet`; and `models.jsonl` with the learned models. The bytes do not depend on which machine replayed a vehicle or on the order of the replays.
 //! Column chunks are copied, so memory does not grow with the number of rows.
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -13,6 +13,7 @@ use super::TableFormat;
 use super::columns::{ALARMS, ESTIMATES, HALF_CYCLES, VEHICLES};
 use super::table::{TableFile, concatenate};
 use crate::error::{LabError, create_folder};
+use crate::fleet::prior::write_models;
 use crate::fleet::vehicle::{RECORD, Vehicle, VehicleRecord};
 
 /// Summary of a merge.
@@ -59,11 +60,14 @@ pub fn merge(folders: &[PathBuf], wanted: Option<&[Vehicle]>, out: &Path) -> Res
         }
     }
     let mut table = TableFile::create(&out.join("vehicles.parquet"), TableFormat::Parquet, VEHICLES)?;
+    let mut models = Vec::new();
     for (name, VehicleFolder { record, .. }) in vehicles {
         table.push(&record)?;
+        models.extend(record.model);
         summary.failed.extend(record.error.map(|error| (name, error)));
     }
     summary.rows.insert("vehicles".to_owned(), table.finish(&metadata)?);
+    write_models(out, &models)?;
     Ok(summary)
 }
 

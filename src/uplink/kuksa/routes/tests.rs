@@ -25,7 +25,7 @@ fn entry(path: &str, id: i32) -> Metadata {
 }
 
 fn reason(metadata: &[Metadata], path: &str) -> String {
-    let (routes, skipped) = Routes::resolve(metadata, BRANCH);
+    let (routes, skipped) = Routes::resolve(metadata, BRANCH, true);
     assert_eq!(routes.len() + skipped.len(), signals::all().count());
     skipped.into_iter().find(|skipped| skipped.path == path).map(|skipped| skipped.reason).unwrap_or_default()
 }
@@ -40,11 +40,20 @@ fn sent(points: &DataPoints, id: i32) -> Option<f32> {
 #[test]
 fn value_is_sent_with_id_of_its_path() {
     for (health, charge) in [(7, 8), (8, 7)] {
-        let (routes, _) = Routes::resolve(&[entry(HEALTH, health), entry(CHARGE, charge)], BRANCH);
+        let (routes, _) = Routes::resolve(&[entry(HEALTH, health), entry(CHARGE, charge)], BRANCH, true);
         let points = routes.points(Some(&document()));
         assert_eq!((sent(&points, health), sent(&points, charge)), (Some(92.8), Some(63.2)));
         assert_eq!(routes.claim().signals.keys().copied().collect::<Vec<_>>(), [7, 8]);
     }
+}
+
+#[test]
+fn lifetime_sums_need_record_of_new_battery() {
+    let (all, skipped) = Routes::resolve(&[], BRANCH, true);
+    let (some, without) = Routes::resolve(&[], BRANCH, false);
+    let sums = |skipped: &[SkippedSignal]| skipped.iter().filter(|it| it.path.contains("Throughput")).count();
+    assert_eq!((all.len(), some.len(), sums(&skipped), sums(&without)), (0, 0, 3, 0));
+    assert_eq!(skipped.len() - without.len(), 5);
 }
 
 #[test]
@@ -73,7 +82,7 @@ fn id_of_two_paths_is_used_for_neither() {
 
 #[test]
 fn value_outside_limits_is_withheld() {
-    let (routes, _) = Routes::resolve(&[entry(HEALTH, 7)], BRANCH);
+    let (routes, _) = Routes::resolve(&[entry(HEALTH, 7)], BRANCH, true);
     let mut status = document();
     status.pack.values.set(Quantity::Soh, Some(1.02));
     let points = routes.points(Some(&status));
@@ -85,7 +94,7 @@ fn value_outside_limits_is_withheld() {
 
 #[test]
 fn missing_document_gives_points_without_values() {
-    let (routes, _) = Routes::resolve(&[entry(HEALTH, 7), entry(CHARGE, 8)], BRANCH);
+    let (routes, _) = Routes::resolve(&[entry(HEALTH, 7), entry(CHARGE, 8)], BRANCH, true);
     let points = routes.points(None);
     assert_eq!(points.by_id.len(), 2);
     assert!(points.by_id.values().all(|point| point.value.is_none() && point.timestamp.is_some()));
@@ -93,7 +102,7 @@ fn missing_document_gives_points_without_values() {
 
 #[test]
 fn request_is_answered_for_own_ids_only() {
-    let (routes, _) = Routes::resolve(&[entry(HEALTH, 7), entry(CHARGE, 8)], BRANCH);
+    let (routes, _) = Routes::resolve(&[entry(HEALTH, 7), entry(CHARGE, 8)], BRANCH, true);
     let points = routes.points_of(&[8, 99], Some(&document()));
     assert_eq!(points.by_id.keys().copied().collect::<Vec<_>>(), [8]);
 }

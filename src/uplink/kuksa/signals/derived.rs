@@ -5,9 +5,11 @@
 //! status document has no value for them:
 //!
 //! * `NetCapacity` and `GrossCapacity`: whole kWh, but the daemon learns Ah.
-//! * The throughputs "over lifetime of the battery": the daemon knows only the time in which it ran.
 //! * `StateOfCharge.Displayed`: the value that the vehicle shows to the customer.
 //! * `Charging.IsCharging`: true only with a charger, but the daemon's mode `charge` includes braking.
+//!
+//! The throughputs "over lifetime of the battery" are provided only if `kuksa.recorded_from_new` states that the daemon
+//! has run since the battery was new, because the daemon counts only while it runs.
 //!
 //! Overlay booleans begin with `Is`, as VSS recommends. No overlay signal has a temperature unit, because the unit's
 //! name changed between VSS 5 and VSS 6. No overlay signal has a list of allowed values: the databroker (0.7) checks
@@ -42,7 +44,7 @@ pub(super) fn signals() -> Vec<Signal> {
     standard.chain(OVERLAY.into_iter().map(signal(Origin::Overlay))).collect()
 }
 
-const STANDARD: [Row; 9] = [
+const STANDARD: [Row; 15] = [
     (
         "CurrentPower",
         DataType::Float,
@@ -117,6 +119,54 @@ const STANDARD: [Row; 9] = [
         "alarms",
         alarm_codes,
         "Raised alarms, `RULE:SEVERITY` or `RULE:SEVERITY:cell3`. Empty only if every threshold was evaluated",
+    ),
+    (
+        "TimeRemaining",
+        DataType::Uint32,
+        Some("s"),
+        "pack.time_to_empty_s",
+        |status| whole(status.pack.values.mean(Quantity::TimeToEmpty)?)?.try_into().ok().map(Value::Uint32),
+        "At the recent load",
+    ),
+    (
+        "AccumulatedChargedThroughput",
+        DataType::Float,
+        Some("Ah"),
+        "pack.moved.charged_ah",
+        |status| float(status.pack.moved.map(|moved| moved.charged_ah)),
+        "Needs `kuksa.recorded_from_new`. Contains regenerative braking",
+    ),
+    (
+        "AccumulatedConsumedThroughput",
+        DataType::Float,
+        Some("Ah"),
+        "pack.moved.discharged_ah",
+        |status| float(status.pack.moved.map(|moved| moved.discharged_ah)),
+        "Needs `kuksa.recorded_from_new`",
+    ),
+    (
+        "AccumulatedChargedEnergy",
+        DataType::Float,
+        Some("kWh"),
+        "pack.moved.charged_wh",
+        |status| float(status.pack.moved.map(|moved| moved.charged_wh / 1e3)),
+        "Needs `kuksa.recorded_from_new`. Contains regenerative braking",
+    ),
+    (
+        "AccumulatedConsumedEnergy",
+        DataType::Float,
+        Some("kWh"),
+        "pack.moved.discharged_wh",
+        |status| float(status.pack.moved.map(|moved| moved.discharged_wh / 1e3)),
+        "Needs `kuksa.recorded_from_new`",
+    ),
+    (
+        "TotalEnergyThroughput",
+        DataType::Uint64,
+        Some("Wh"),
+        "pack.moved.charged_wh, pack.moved.discharged_wh",
+        |status| whole(status.pack.moved.map(|moved| moved.charged_wh + moved.discharged_wh)?).map(Value::Uint64),
+        "Needs `kuksa.recorded_from_new`",
     ),
 ];
 
@@ -253,6 +303,12 @@ fn cell(cell: Option<CellIndex>) -> Option<Value> {
 
 fn count(count: usize) -> Option<Value> {
     count.try_into().ok().map(Value::Uint16)
+}
+
+/// Rounds to a whole number; `None` if the number is negative or above 1e15.
+fn whole(number: f64) -> Option<u64> {
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "the range is checked")]
+    (0.0..=1e15).contains(&number).then(|| number.round() as u64)
 }
 
 /// Returns a word of the status document, spelled as in its JSON.

@@ -68,3 +68,22 @@ fn pack_entity_needs_daemon_and_uplink_entity_does_not() {
     }
     assert_eq!(availability("queue_messages").0, json!([{ "topic": "packwatch/status" }]));
 }
+
+#[test]
+fn only_soc_is_battery_and_details_are_off() {
+    let all = messages(&MqttSettings::default(), &document());
+    let configs: Vec<Value> = all.iter().map(|message| serde_json::from_str(&message.text).unwrap()).collect();
+    let keys = |is_so: &dyn Fn(&Value) -> bool| -> Vec<&str> {
+        let chosen = configs.iter().filter(|config| is_so(config));
+        chosen.map(|config| config["unique_id"].as_str().unwrap().trim_start_matches("packwatch_")).collect()
+    };
+    assert_eq!(keys(&|config| config["device_class"] == "battery"), ["SOC_real", "SOC"]);
+    let is_off = |config: &Value| config["enabled_by_default"] == false;
+    let off = keys(&is_off);
+    for key in ["battery_voltage_cell1", "SOC_std", "state_of_health_std", "late_ticks"] {
+        assert!(off.contains(&key), "{key}: {off:?}");
+    }
+    for key in ["SOC", "state_of_health", "alarm_capacity_low", "event", "dropped_events", "missed_events"] {
+        assert!(!off.contains(&key), "{key}: {off:?}");
+    }
+}

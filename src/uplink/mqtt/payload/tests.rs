@@ -109,6 +109,6 @@ fn alarm_event_has_rule_severity_and_wall_time() {
     let event = event(&document, &raised);
     assert_eq!(event["time"], "2027-01-15T08:01:35.000Z");
     assert_eq!((&event["event_type"], &event["severity"]), (&json!("capacity_low"), &json!("warning")));
-    assert_eq!(event["message"], "capacity_low raised, cell 3, threshold 2.5, value 2.4123");
+    assert_eq!(event["message"], "capacity low raised: cell 3, severity warning, threshold 2.500 Ah, value 2.412 Ah");
     assert_eq!(event["data"], raised);
 }

@@ -26,10 +26,10 @@ fn event(text: &str) -> (Class, String) {
 fn messages_keep_order_across_restart() {
     let folder = tempfile::tempdir().unwrap();
     let queue = Queue::open(&settings(folder.path(), 10, 1000)).unwrap();
-    queue.add(&[event("{e1}"), sample("{s1 ä}")], Some("[1]")).unwrap();
+    queue.add(&[event("{e1}"), sample("{s1 ä}")], Some(("[1]", 7))).unwrap();
     queue.add(&[sample("{s2}")], None).unwrap();
     let before = queue.fill();
-    assert_eq!((before.messages, before.bytes), (3, 4 + 7 + 4));
+    assert_eq!((before.messages, before.bytes, before.missed_events), (3, 4 + 7 + 4, 7));
     drop(queue);
     let queue = Queue::open(&settings(folder.path(), 10, 1000)).unwrap();
     assert_eq!((queue.fill(), queue.seen().as_deref()), (before, Some("[1]")));

@@ -2,14 +2,13 @@
 
 use super::super::settings::HistorySettings;
 use super::*;
-use serde_json::json;
 
 const START: i64 = 1_800_000_000;
 
 fn document(second: f64) -> StatusDocument {
     let mut document: StatusDocument = serde_json::from_str(include_str!("../../tests/data/status.json")).unwrap();
     document.time = Timestamp::from_secs(second);
-    document.events.clear();
+    (document.events, document.event_count) = (Vec::new(), 0);
     document
 }
 
@@ -45,35 +44,57 @@ fn schedule_restarts_after_pause_or_clock_step() {
     assert_eq!(sampled(10, &[1000.0, 1005.0, 100.0, 105.0, 110.0]), [1000.0, 100.0, 110.0]);
 }
 
-#[test]
-fn new_events_are_those_not_listed_before() {
-    let list = |numbers: &[i64]| numbers.iter().map(|&number| json!({ "time": number })).collect::<Vec<_>>();
-    for (before, now, new) in [
-        (&[][..], &[1, 2][..], &[1, 2][..]),
-        (&[1, 2], &[1, 2], &[]),
-        (&[1, 2], &[1, 2, 3], &[3]),
-        // The daemon dropped its oldest event.
-        (&[1, 2, 3], &[2, 3, 4], &[4]),
-        (&[1, 2, 3], &[7, 8, 9], &[7, 8, 9]),
-        // Two events of the same time.
-        (&[1, 1], &[1, 1, 1], &[1]),
-        // Another daemon, which has no events.
-        (&[1, 2, 3], &[], &[]),
-    ] {
-        assert_eq!(new_events(&list(before), &list(now)), list(new), "{before:?} {now:?}");
-    }
+/// Numbers of the queued events in order, and -1 for a restart of the daemon; a negative number is a count of missed
+/// events times 1,000.
+fn queued(queue: &Queue) -> Vec<i64> {
+    let number = |body: &str| {
+        let event: Value = serde_json::from_str(body).unwrap();
+        match event["event_type"].as_str().unwrap() {
+            "daemon_restarted" => -1,
+            "events_missed" => -1000 * event["data"]["missed"].as_i64().unwrap(),
+            _ => event["data"]["seconds"].as_i64().unwrap(),
+        }
+    };
+    queue.oldest(Class::Event, 10_000).unwrap().iter().map(|queued| number(&queued.body)).collect()
+}
+
+/// A document of the run `started` that lists the events `first..=last`.
+fn with_events(started: i64, first: i64, last: i64) -> StatusDocument {
+    let mut document = document(START as f64);
+    document.started = Timestamp::from_nanos(started);
+    document.events = (first..=last).map(|number| json!({ "event": "gap", "time": 0, "seconds": number })).collect();
+    document.event_count = last.unsigned_abs();
+    document
 }
 
 #[test]
-fn event_is_queued_once_across_restart() {
-    let folder = tempfile::tempdir().unwrap();
-    let mut with_event = document(START as f64);
-    with_event.events = vec![json!({ "event": "gap", "time": START * 1_000_000_000, "seconds": 4.0 })];
-    for messages in [1, 1] {
-        let queue = queue(&folder);
-        let mut recorder = Recorder::new(&queue, 0);
-        recorder.take(&with_event);
-        recorder.take(&with_event);
-        assert_eq!(queue.fill().messages, messages);
+fn each_event_is_queued_once_or_counted() {
+    for (documents, events, missed) in [
+        // First start: events that left the list earlier are not counted.
+        (&[(1, 5, 9)][..], &[5, 6, 7, 8, 9][..], 0),
+        (&[(1, 1, 0), (1, 1, 2), (1, 1, 2), (1, 2, 4)], &[1, 2, 3, 4], 0),
+        (&[(1, 1, 2), (1, 67, 98)], &[&[1, 2, -64_000][..], &(67..=98).collect::<Vec<_>>()].concat(), 64),
+        (&[(1, 1, 2), (1, 6, 7), (1, 9, 9)], &[1, 2, -3000, 6, 7, -1000, 9], 4),
+        // The daemon restarts, also with a smaller and with a higher number.
+        (&[(1, 1, 3), (2, 1, 1)], &[1, 2, 3, -1, 1], 0),
+        (&[(1, 1, 3), (2, 3, 4)], &[1, 2, 3, -1, -2000, 3, 4], 2),
+    ] {
+        let folder = tempfile::tempdir().unwrap();
+        let mut fill = Fill::default();
+        for (index, &(started, first, last)) in documents.iter().enumerate() {
+            // The uplink restarts before each document.
+            let queue = queue(&folder);
+            Recorder::new(&queue, 0).take(&with_events(started, first, last));
+            fill = queue.fill();
+            if index + 1 == documents.len() {
+                assert_eq!(queued(&queue), events, "{documents:?}");
+            }
+        }
+        assert_eq!(fill.missed_events, missed, "{documents:?}");
     }
+    // A daemon of an older version does not number its events.
+    let folder = tempfile::tempdir().unwrap();
+    let queue = queue(&folder);
+    Recorder::new(&queue, 0).take(&StatusDocument { event_count: 0, ..with_events(1, 1, 2) });
+    assert!(queued(&queue).is_empty());
 }

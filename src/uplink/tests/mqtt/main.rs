@@ -20,7 +20,7 @@ fn cells_are_published_in_millivolts_and_retained() {
     let mut pack = document(96, 0);
     pack["cells"][95]["voltage_v"] = Value::Null;
     daemon.send(&pack);
-    wait_for("discovery", || Reader::retained(&broker, "homeassistant/#").len() == 177);
+    wait_for("discovery", || Reader::retained(&broker, "homeassistant/#").len() == 178);
     // This reader connects late and gets the retained messages.
     let kept: BTreeMap<_, _> = Reader::retained(&broker, "packwatch/#").into_iter().collect();
     assert_eq!(
@@ -136,6 +136,7 @@ fn full_queue_drops_oldest_samples_first_and_counts() {
         pack["events"] = (0..=second / 10)
             .map(|number| serde_json::json!({ "event": "gap", "seconds": number, "time": number }))
             .collect();
+        pack["event_count"] = (second / 10 + 1).into();
         daemon.send(&pack);
         wait_for("the disk", || fill(&uplink).written > before);
     }
@@ -157,7 +158,39 @@ fn full_queue_drops_oldest_samples_first_and_counts() {
     assert_eq!(samples, (170..200).collect::<Vec<_>>(), "the newest samples are left");
     wait_for("the count", || {
         let uplink = Reader::retained(&broker, "packwatch/uplink").pop().map(|(_, text)| text).unwrap_or_default();
-        uplink == "{\"dropped_events\":0,\"dropped_samples\":170,\"queue_bytes\":0,\"queue_messages\":0}"
+        uplink
+            == "{\"dropped_events\":0,\"dropped_samples\":170,\"missed_events\":0,\"queue_bytes\":0,\"queue_messages\":0}"
+    });
+}
+
+#[test]
+fn burst_of_events_without_broker_is_delivered_or_counted() {
+    let (mut broker, daemon) = (Broker::start(""), Daemon::start());
+    let reader = Reader::start(&broker, &["packwatch/events"]);
+    broker.stop();
+    let uplink = Uplink::start(&broker, &daemon, "retry_max_s = 1\n[mqtt.history]\nperiod_s = 0\n");
+    // The daemon lists at most 1,024 events: all of a burst of 1,000, and not all of a burst of 2,000.
+    for (second, first, last) in [(0, 1, 2), (1, 1, 1002), (2, 1979, 3002)] {
+        let mut pack = document(2, second);
+        let event = |number: i64| serde_json::json!({ "event": "gap", "seconds": number, "time": number });
+        pack["events"] = (first..=last).map(event).collect();
+        pack["event_count"] = last.into();
+        let before = fill(&uplink).written;
+        daemon.send(&pack);
+        wait_for("the disk", || fill(&uplink).written > before);
+    }
+    let _uplink = uplink.restart();
+    broker.restart();
+    reader.wait_for_messages(2027);
+    let numbers: BTreeSet<i64> =
+        reader.messages().iter().filter_map(|(_, event)| event["data"]["seconds"].as_i64()).collect();
+    assert_eq!(numbers, (1..=1002).chain(1979..=3002).collect());
+    let missed: Vec<Value> = reader.messages().iter().map(|(_, event)| event["data"]["missed"].clone()).collect();
+    assert_eq!(missed[1002], 976, "in place of the missed events");
+    wait_for("the count", || {
+        let uplink = Reader::retained(&broker, "packwatch/uplink").pop().map(|(_, text)| text).unwrap_or_default();
+        uplink
+            == "{\"dropped_events\":0,\"dropped_samples\":0,\"missed_events\":976,\"queue_bytes\":0,\"queue_messages\":0}"
     });
 }
 
@@ -180,6 +213,7 @@ fn rejected_topic_does_not_stop_others() {
     for topic in ["packwatch/events", "packwatch/info", "homeassistant/"] {
         assert!(log.lines().filter(|line| line.contains(topic)).count() <= 1, "once, not each time: {log}");
     }
+    assert!(!log.contains("rumqttc"), "the library repeats each rejection: {log}");
     assert_eq!(log.matches("connected broker").count(), 1, "the connection stays: {log}");
     wait_for("the refused events alone", || fill(&uplink).messages == 2);
 

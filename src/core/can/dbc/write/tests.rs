@@ -3,7 +3,7 @@
 use proptest::prelude::*;
 
 use super::*;
-use crate::can::dbc::Repetition;
+use crate::can::dbc::{Repetition, lowest};
 use crate::can::e2e::{Profile, Protection};
 use crate::can::encode::{LayoutBase, LayoutSettings, MessageSettings, default_database, layout};
 use crate::can::secoc::{self, Authentication};
@@ -67,15 +67,11 @@ fn layouts() -> impl Strategy<Value = SignalLayout> {
     ];
     let order = prop_oneof![Just(ByteOrder::LittleEndian), Just(ByteOrder::BigEndian)];
     (any::<u16>(), any::<u16>(), order, kind, [number.clone(), number.clone(), number.clone(), number]).prop_map(
-        |(start_bit, length_bits, byte_order, value_type, [factor, offset, minimum, maximum])| SignalLayout {
-            start_bit,
-            length_bits,
-            byte_order,
-            value_type,
-            factor,
-            offset,
-            minimum,
-            maximum,
+        |(start_bit, length_bits, byte_order, value_type, [factor, offset, minimum, maximum])| {
+            let layout =
+                SignalLayout { start_bit, length_bits, byte_order, value_type, factor, offset, minimum, maximum };
+            // A range that states the size of both ends is read as the range that it means.
+            SignalLayout { minimum: lowest(&layout), ..layout }
         },
     )
 }

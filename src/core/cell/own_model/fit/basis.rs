@@ -32,6 +32,8 @@ pub(super) const BEGINNING: (f64, f64) = (-0.05, 1.05);
 pub(super) struct Basis<'a> {
     pub(super) model: &'a CellModel,
     pub(super) curve: &'a CurvePrior,
+    /// The expected model; `None` = the label's model.
+    expected: Option<&'a OwnModel>,
     pub(super) rows: &'a [Row],
     /// Stretch of each row, counted from 0.
     pub(super) stretch: Vec<usize>,
@@ -59,7 +61,8 @@ impl<'a> Basis<'a> {
     pub(super) fn new(prior: &'a LabelPrior, rows: &'a [Row]) -> Self {
         let stretches = rows.chunk_by(|a, b| a.stretch == b.stretch);
         let stretch = stretches.enumerate().flat_map(|(k, rows)| vec![k; rows.len()]).collect();
-        Self { model: &prior.model, curve: &prior.curve, rows, stretch }
+        let expected = prior.fleet.as_ref().map(|fleet| &fleet.mean);
+        Self { model: &prior.model, curve: &prior.curve, expected, rows, stretch }
     }
 
     /// Number of parameters.
@@ -67,8 +70,9 @@ impl<'a> Basis<'a> {
         BEGINNINGS + self.stretch.last().map_or(0, |last| last + 1)
     }
 
-    /// The parameters of a model (`None` = the label's model), with the most likely SOC at the start of each stretch.
+    /// The parameters of a model (`None` = the expected model), with the most likely SOC at the start of each stretch.
     pub(super) fn parameters(&self, own: Option<&OwnModel>) -> DVector<f64> {
+        let own = own.or(self.expected);
         let mut theta = DVector::zeros(self.size());
         theta[LOG_CAPACITY] = libm::log(own.map_or(self.model.rated_capacity_ah, |own| own.capacity.mean));
         if let Some(own) = own {

@@ -165,6 +165,12 @@ impl AlarmQueue {
         Some(next)
     }
 
+    /// Skips the frames in turn that are due.
+    pub(crate) fn skip_turns(&mut self, now: Timestamp, engine: &AlarmEngine, period_s: f64) {
+        let next = now.plus_nanos(Self::turn_ns(engine, period_s));
+        self.turn = self.turn.map(|turn| if turn > now { turn } else { next });
+    }
+
     /// The next alarm to announce as unknown, if any. Returns `None` if the budget is used up, or if a new alarm would
     /// exceed [`MAX_UNKNOWN`].
     pub(crate) fn take_unknown(&mut self, now: Timestamp, engine: &AlarmEngine, turn: usize) -> Option<Alarm> {

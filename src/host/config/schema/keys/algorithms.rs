@@ -301,13 +301,12 @@ section! {
     /// Limits for the remaining energy, the times to empty and to full, and the power.
     Outlook at "outlook" gives OutlookConfig, |keys, usable: Option<UsableConfig>, rated_ah: f64| {
         /// Lowest voltage of a cell under load.
-        min_voltage_v: Option<f64>, "V", Above(0.0, 100.0), Optional("`cutoff_v` of `[usable]`, else the cell model's lowest voltage")
-            => min_voltage_v: keys.min_voltage_v.or(usable.map(|usable| usable.cutoff_v));
+        min_voltage_v: Option<f64>, "V", Above(0.0, 100.0), Optional("the cell model's lowest voltage");
         /// Highest voltage of a cell under charge.
         max_voltage_v: Option<f64>, "V", Above(0.0, 100.0), Optional("the cell model's highest voltage");
         /// Largest discharge current, per cell.
         max_discharge_a: Option<f64>, "A", Above(0.0, 1e6), Optional("only the voltages limit the current");
-        /// Largest charging current, per cell.
+        /// Largest charging current, per cell. Below 0 degrees C, a voltage limit does not prevent lithium plating; only this limit does.
         max_charge_a: Option<f64>, "A", Above(0.0, 1e6), Optional("only the voltages limit the current");
         /// A charge is complete when its current, per cell, has dropped to this value at the highest voltage.
         taper_current_a: Option<f64>, "A", Above(0.0, 1e6), Optional("`taper_current_a` of `[usable]`, else C/20: the rated capacity over 20 h")

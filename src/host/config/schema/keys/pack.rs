@@ -34,6 +34,8 @@ section! {
         cell_model: Option<String>, "", NotEmpty, Optional("a model made from `chemistry` and `rated_capacity_ah`");
         /// Chemistry of a cell without a model file. Estimates start from values typical of this chemistry, and their intervals cover the differences between such cells. "lmo-graphite" means the blend with a layered oxide used in early electric cars. Use "nmc-graphite" if the nickel content is unknown. `-graphite` may be left out.
         chemistry: Option<Chemistry>, "", Any, Optional("required without `cell_model`");
+        /// Prior of a fleet, written by `packwatch fleet prior`, relative to this file. Estimates then start from what other vehicles have learned about cells with the same chemistry, rated capacity and voltages, instead of values typical of the chemistry.
+        prior: Option<String>, "", NotEmpty, Optional("values typical of `chemistry`");
         /// Whether the daemon learns the model of cells without a model file on board, from drives, charges and rests.
         learn_model: bool, "", Any, Default("true");
         /// Whether the BMS balances, that is, discharges the fuller cells near and after the end of a charge. If it does, only the cell with the least charge can be recognised as leaking, unless `[input.balancing]` shows which cells are bled.

@@ -13,7 +13,7 @@ section! {
     Poll at "poll" {
         /// Whether requests are sent.
         enabled: bool, "", Any, Default("false");
-        /// Largest number of requests per second, for all answers together.
+        /// Largest number of sent frames (requests and flow control) per second, for all answers together.
         max_requests_per_s: f64, "1/s", Between(0.01, 100.0), Default("10.0");
     }
 }
@@ -57,6 +57,8 @@ section! {
         interfaces: Option<Vec<String>>, "", NotEmpty, Optional("all");
         /// DBC that defines the layout of the frames, relative to this file.
         dbc: Option<String>, "", NotEmpty, Optional("built-in `packwatch.dbc`, with an Ah resolution that fits the cell");
+        /// Whether cyclic frames (with DM1 of `[j1939]`) go on while the buses sleep (`input.asleep_after_s`). They can keep other nodes awake and empty a battery. Alarm changes, replies and tests are always sent.
+        while_asleep: bool, "", Any, Default("false");
     }
 }
 

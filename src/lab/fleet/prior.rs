@@ -1,0 +1,59 @@
+//! Turns the models that the vehicles of a fleet have learned into a prior for the next vehicle with the same label.
+//!
+//! Input: a folder of merged tables with `models.jsonl`, which has a line per learned model. Output: a [`FleetPrior`].
+//! The same models give the same prior.
+
+use std::path::Path;
+
+use super::vehicle::LearnedModel;
+use crate::cell::{FleetPrior, Label, OwnModel};
+use crate::error::LabError;
+
+/// File with the learned models, in the folder of the merged tables.
+pub const MODELS: &str = "models.jsonl";
+/// Fewest vehicles of a prior. The spread between two vehicles says almost nothing about the spread between all.
+const LEAST_VEHICLES: usize = 3;
+
+/// Writes the learned models of all vehicles, in the order of the vehicles' names.
+pub(super) fn write_models(folder: &Path, models: &[LearnedModel]) -> Result<(), LabError> {
+    let lines = models.iter().map(serde_json::to_string).collect::<Result<Vec<_>, _>>()?;
+    Ok(crate::write_file(
+        &folder.join(MODELS),
+        lines.iter().map(|line| line.clone() + "\n").collect::<String>().as_bytes(),
+    )?)
+}
+
+/// Combines the models whose label is wanted, in a folder of merged tables.
+///
+/// # Errors
+/// The file is missing or damaged, the wanted models have several labels, or fewer than three vehicles have a wanted
+/// model.
+pub fn combine(folder: &Path, is_wanted: impl Fn(&Label) -> bool) -> Result<FleetPrior, LabError> {
+    let path = folder.join(MODELS);
+    let fault = |what: &str| LabError::Data(format!("{}: {what}", path.display()));
+    let text = std::fs::read_to_string(&path)
+        .map_err(|error| LabError::File(format!("{}: {error}; `packwatch fleet merge` writes it", path.display())))?;
+    let mut by_label: Vec<(Label, Vec<OwnModel>)> = Vec::new();
+    for (number, line) in (1..).zip(text.lines()) {
+        let of_line = |error: &dyn std::fmt::Display| fault(&format!("line {number}: {error}"));
+        let LearnedModel { label, own } = serde_json::from_str(line).map_err(|error| of_line(&error))?;
+        own.check().map_err(|error| of_line(&error))?;
+        match by_label.iter_mut().find(|(known, _)| *known == label) {
+            Some((_, models)) => models.push(own),
+            None => by_label.push((label, vec![own])),
+        }
+    }
+    let found: Vec<String> = by_label.iter().map(|(label, models)| format!("{label}: {}", models.len())).collect();
+    let found = if found.is_empty() { "none".to_owned() } else { found.join("; ") };
+    by_label.retain(|(label, _)| is_wanted(label));
+    let [(label, models)] = by_label.as_slice() else {
+        let what =
+            format!("learned models of {} wanted labels, must be 1 (vehicles with a model: {found})", by_label.len());
+        return Err(fault(&what));
+    };
+    if models.len() < LEAST_VEHICLES {
+        let what = format!("{} vehicles have a model of {label}, must be at least {LEAST_VEHICLES}", models.len());
+        return Err(fault(&what));
+    }
+    FleetPrior::new(label, models).ok_or_else(|| fault(&format!("no cell has the label {label}")))
+}
