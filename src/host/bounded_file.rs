@@ -2,13 +2,13 @@
 //! place could fill the memory, so at most [`MAX_BYTES`] are read, from regular files and from pipes (`<(command)` in a
 //! shell). A pipe without data does not block the program for ever.
 
-use std::fs::{File, OpenOptions};
+use std::fs::{File, FileType, OpenOptions};
 use std::io::{self, Read as _};
 use std::os::unix::fs::{FileTypeExt as _, OpenOptionsExt as _};
 use std::path::Path;
 use std::time::Duration;
 
-use nix::libc::O_NONBLOCK;
+use nix::libc::{EISDIR, O_NONBLOCK};
 
 /// Maximum size of a file, bytes. The DBC of a whole vehicle has 10 MB.
 pub const MAX_BYTES: u64 = 64 << 20;
@@ -23,7 +23,13 @@ const PIPE_RETRY: Duration = Duration::from_millis(10);
 /// Fails if the path is not a regular file, or if the file cannot be opened. The error does not name the file.
 pub fn open(path: &Path) -> io::Result<File> {
     let file = open_any(path)?;
-    if file.metadata()?.is_file() { Ok(file) } else { Err(io::Error::other("is not a regular file")) }
+    let kind = file.metadata()?.file_type();
+    if kind.is_file() { Ok(file) } else { Err(unreadable(kind)) }
+}
+
+/// Why a folder, a device or a pipe is not read.
+fn unreadable(kind: FileType) -> io::Error {
+    if kind.is_dir() { io::Error::from_raw_os_error(EISDIR) } else { io::Error::other("is not a regular file") }
 }
 
 /// Opens anything without waiting.
@@ -40,7 +46,7 @@ pub fn read(path: &Path) -> io::Result<Vec<u8>> {
     let file = open_any(path)?;
     let kind = file.metadata()?.file_type();
     if !kind.is_file() && !kind.is_fifo() {
-        return Err(io::Error::other("is not a regular file"));
+        return Err(unreadable(kind));
     }
     let (mut bytes, mut part) = (Vec::new(), file.take(MAX_BYTES + 1));
     let mut waited = Duration::ZERO;
@@ -71,9 +77,8 @@ mod tests {
     fn device_folder_and_long_file_are_rejected() {
         let folder = tempfile::tempdir().expect("a folder");
         let fault = |path: &Path| read(path).expect_err("rejected").to_string();
-        for path in [Path::new("/dev/zero"), folder.path()] {
-            assert_eq!(fault(path), "is not a regular file", "{}", path.display());
-        }
+        assert_eq!(fault(Path::new("/dev/zero")), "is not a regular file");
+        assert_eq!(fault(folder.path()), "Is a directory (os error 21)");
         let long = folder.path().join("long");
         File::create(&long).and_then(|file| file.set_len(MAX_BYTES + 1)).expect("created");
         assert_eq!(fault(&long), "must be at most 67108864 bytes");

@@ -180,7 +180,7 @@ mod tests {
         };
         assert!(error(&source, None).contains("can.key: cannot be read: No such file or directory"));
         std::fs::create_dir(&path).unwrap();
-        assert!(error(&source, None).contains("can.key: cannot be read: is not a regular file"));
+        assert!(error(&source, None).contains("can.key: cannot be read: Is a directory"));
         std::fs::remove_dir(&path).unwrap();
         std::fs::write(&path, KEY).unwrap();
         for (mode, is_good) in [(0o600, true), (0o400, true), (0o640, false), (0o604, false), (0o620, false)] {
