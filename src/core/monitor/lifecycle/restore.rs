@@ -145,11 +145,11 @@ impl Stages {
         self.packs.retain(|pack| pack.fits(bank));
         self.sending.schedule = snapshot.sending.schedule.clone();
         if !is_continued {
-            self.sending.begin_freshness(now);
+            self.sending.schedule.begin_freshness(now);
             self.sending.restore_silence(&snapshot.sending, snapshot.time, now);
             let was_asleep = snapshot.asleep_since.is_some();
             let after_s = self.sleep.after_s.filter(|_| !was_asleep).unwrap_or(0.0);
-            self.sending.set_quiet_from(now.plus_secs(after_s));
+            self.sending.schedule.set_quiet_from(now.plus_secs(after_s));
         }
         self.sleep.since = snapshot.asleep_since;
         self.restore_alarms(now, &snapshot.alarming.alarms, is_continued, out);
