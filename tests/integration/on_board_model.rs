@@ -349,9 +349,15 @@ fn vehicle_starts_from_what_a_fleet_has_learned() {
         let mut live = Live::new(config);
         frames.iter().for_each(|frame| live.take(frame));
         let last = live.monitor.latest().next().flatten().unwrap();
+        live.give(Record::unknown_gap(Timestamp::from_secs(4e9)));
+        let own = live.monitor.model().own.map(|own| (own.capacity, own.rest_v[10]));
         // The cell ends its cycle at the upper end of its range.
-        (last.soc - 0.85, last.soc_std)
+        (last.soc - 0.85, last.soc_std, own)
     });
-    let [(_, label_std), (off, std)] = errors;
+    let [(_, label_std, by_label), (off, std, by_fleet)] = errors;
     assert!(std < 0.8 * label_std && off.abs() < 1.96 * std, "{errors:?}");
+    // The vehicle's own fit starts from the fleet, too: after one cycle, it knows the cell better.
+    let (label_ah, fleet_ah) = (by_label.map(|own| own.0), by_fleet.expect("a learned model").0);
+    assert!((fleet_ah.mean - TRUE_AH).abs() < 1.96 * fleet_ah.std(), "{errors:?}");
+    assert!(label_ah.is_none_or(|label_ah| fleet_ah.std() < 0.9 * label_ah.std()), "{errors:?}");
 }

@@ -91,11 +91,6 @@ impl Schedule {
         self.sent_freshness = self.sent_freshness.saturating_add(RESTART_FRESHNESS).max(by_clock);
     }
 
-    /// Freshness of the last authenticated frame.
-    pub(crate) fn sent_freshness(&self) -> u64 {
-        self.sent_freshness
-    }
-
     /// Whether the status, health and alarm frames and the digest are due.
     pub(super) fn take_frames_due(&mut self, now: Timestamp, config: &OutputConfig) -> [bool; 4] {
         let due = [
