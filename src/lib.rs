@@ -28,7 +28,7 @@
 //! | | [`status`] | status document, metrics |
 //! | | [`service`] | the live loop: links, ticks, readiness, reload, watchdog |
 //! | | `http` | HTTP server of the exporter and of the uplink |
-//! | | [`exporter`] | metrics for Prometheus |
+//! | | [`exporter`] | live page, metrics for Prometheus |
 //! | | [`replay`] | the loop over recorded logs |
 //! | | [`wiring_check`] | the two loops of `packwatch doctor`: over logs and over live input |
 //! | | `failure` | text and exit code of a failed command, for every program |

@@ -7,7 +7,7 @@
 //! * `/`: the live page; `/events`: its server-sent events; `/-/healthy`: a liveness check.
 //! * `/report`: the report of the daemon's store, if this program can make reports.
 //! * On the address of a network, the page and the events need a token ([`Access`]).
-//! * The connections are those of [`http`].
+//! * [`http`] limits connections and request heads.
 //! * SIGTERM and SIGINT stop the exporter cleanly.
 
 mod access;

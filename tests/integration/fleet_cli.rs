@@ -320,7 +320,7 @@ fn prior_of_fleet_is_reproducible_and_configures_vehicle() {
         (
             2.5,
             "one.toml",
-            "is for nmc811-graphite 2.6 Ah, 2.5 to 4.2 V, must be for the cells of [pack]: nmc811-graphite 2.5 Ah",
+            "was made for nmc811-graphite 2.6 Ah, 2.5 to 4.2 V, but [pack] describes nmc811-graphite 2.5 Ah",
         ),
         (2.6, "damaged.toml", "the capacity of a learned model is -2.4"),
         (2.6, "list.toml", "must be a file of `packwatch fleet prior`: list.toml: unknown field `names`"),

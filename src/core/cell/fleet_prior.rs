@@ -1,14 +1,15 @@
 //! Combines the models that many vehicles have learned for one label into a prior for the next vehicle.
 //!
-//! In: one [`OwnModel`] per vehicle. Out: a [`FleetPrior`], which replaces the values that are typical of the chemistry.
+//! In: one [`OwnModel`] per vehicle. Out: a [`FleetPrior`], which replaces the values that are typical of the
+//! chemistry.
 //!
-//! Each quantity (the curve at each SOC, a resistance, the capacity) varies between the cells of the label with an unknown
-//! variance P. A vehicle's fit gives the mean m and the posterior variance V; it started from the label's variance L. The
-//! variance of the means over the vehicles contains the part of P that the data showed, and the errors of the fits. The
-//! data did not show the part V^2 / L, which is the share of the label's uncertainty in V (Joseph's form of the update).
-//! The estimate of P is the sum of both. For the curve, L is a covariance between the SOC, and each vehicle scales it at
-//! each SOC by V / L. Few vehicles say little about P, so the label's covariance counts as [`LABEL_VEHICLES`] more
-//! vehicles.
+//! Each quantity (the curve at each SOC, a resistance, the capacity) varies between the cells of the label with an
+//! unknown variance P. A vehicle's fit gives the mean m and the posterior variance V; it started from the label's
+//! variance L. A fit pulls its mean toward the label's mean, so the means vary less than the cells. The missing part is
+//! V^2 / L: the share of V that comes from the label (Joseph form of the update). The estimate of P is the variance of
+//! the means plus this part. For the curve, L is a covariance matrix over the SOC breakpoints. Each vehicle scales its
+//! rows and columns by V / L at that SOC. Few vehicles say little about P, so the label's covariance counts as
+//! [`LABEL_VEHICLES`] more vehicles.
 
 use nalgebra::DMatrix;
 use serde::{Deserialize, Serialize};
@@ -20,7 +21,7 @@ use super::own_model::{OwnModel, SOC_NODES};
 use crate::filter::ScalarGaussian;
 use crate::quantity::InvalidState;
 
-/// Number of vehicles that the label counts for.
+/// Weight of the label's variance, as a number of vehicles.
 const LABEL_VEHICLES: f64 = 2.0;
 
 /// What is known about a cell of a label after other vehicles with this label have learned their models.

@@ -18,8 +18,8 @@ use read_ahead::ReadAhead;
 /// bytes.
 const BLOCK: usize = 256 * 1024;
 
-/// Largest expansion of a compressed log. The logs of parked vehicles expand less than a hundred times, because each line
-/// has its own time. zstd stores zeros in a 30,000th of their size.
+/// Largest expansion of a compressed log. The logs of parked vehicles expand less than a hundred times, because each
+/// line has its own time. zstd stores zeros in a 30,000th of their size.
 const MAX_EXPANSION: u64 = 1000;
 /// Smaller compressed files may expand as much as a file of this size, bytes.
 const MIN_PACKED: u64 = 4096;
@@ -85,7 +85,7 @@ impl Read for ExpansionLimit {
         let packed = self.packed.load(Ordering::Relaxed);
         if self.expanded > MAX_EXPANSION * packed.max(MIN_PACKED) {
             let what = format!(
-                "{packed} bytes expand to more than {} bytes, must be a log: at most {MAX_EXPANSION} times",
+                "{packed} bytes expand to more than {} bytes, a compressed log must expand at most {MAX_EXPANSION} times",
                 self.expanded
             );
             return Err(io::Error::new(io::ErrorKind::InvalidData, what));
@@ -188,8 +188,8 @@ impl Lines {
         }
     }
 
-    /// Returns the first bytes and does not consume them: at least `len` (at most 256 KiB) bytes, or the whole source if
-    /// it is shorter. Must be called before any line is consumed.
+    /// Returns the first bytes and does not consume them: at least `len` (at most 256 KiB) bytes, or the whole source
+    /// if it is shorter. Must be called before any line is consumed.
     ///
     /// # Errors
     /// Returns the errors of the source.

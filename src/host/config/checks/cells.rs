@@ -83,9 +83,7 @@ pub(crate) fn fleet_prior(path: &Path, pack: &Pack, read: ReadFile<'_>) -> Optio
     });
     match parsed {
         Ok(prior) if prior.label == label => return Some(prior),
-        Ok(prior) => {
-            pack.place.fault("prior", format!("is for {}, must be for the cells of [pack]: {label}", prior.label))
-        }
+        Ok(prior) => pack.place.fault("prior", format!("was made for {}, but [pack] describes {label}", prior.label)),
         Err(error) => {
             let what = format!("must be a file of `packwatch fleet prior`: {}: {error}", file.display());
             pack.place.fault("prior", what);

@@ -206,7 +206,7 @@ fn health(raw: &RawTables, model: Option<&CellModel>) {
             outlook.place.fault("min_voltage_v", &what);
         }
         if outlook.max_voltage_v.is_some_and(|max_v| max_v <= min_v || max_v > high_v) {
-            outlook.place.fault("max_voltage_v", format!("must be above {min_v}, the lowest voltage, to {high_v}"));
+            outlook.place.fault("max_voltage_v", format!("must be above min_voltage_v = {min_v} and at most {high_v}"));
         }
     }
     if let (Some(usable), Some(model)) = (&raw.usable, model)

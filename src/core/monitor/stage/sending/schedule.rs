@@ -39,7 +39,8 @@ pub(crate) struct Schedule {
     /// Whether cyclic frames are omitted, because the buses sleep.
     #[serde(default)]
     pub(super) is_quiet: bool,
-    /// Time before which a sleep omits no frames. After a restart, the program first has to hear the silence itself.
+    /// Cyclic frames are sent until this time, even if the buses sleep. After a restart, the program must first observe
+    /// the silence itself.
     #[serde(default)]
     pub(super) quiet_from: Timestamp,
 }

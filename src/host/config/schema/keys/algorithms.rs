@@ -306,7 +306,7 @@ section! {
         max_voltage_v: Option<f64>, "V", Above(0.0, 100.0), Optional("the cell model's highest voltage");
         /// Largest discharge current, per cell.
         max_discharge_a: Option<f64>, "A", Above(0.0, 1e6), Optional("only the voltages limit the current");
-        /// Largest charging current, per cell. Below 0 degrees C, a voltage limit does not prevent lithium plating; only this limit does.
+        /// Largest charging current, per cell. Set it for use below 0 degrees C: there, the voltage limit alone allows currents that cause lithium plating.
         max_charge_a: Option<f64>, "A", Above(0.0, 1e6), Optional("only the voltages limit the current");
         /// A charge is complete when its current, per cell, has dropped to this value at the highest voltage.
         taper_current_a: Option<f64>, "A", Above(0.0, 1e6), Optional("`taper_current_a` of `[usable]`, else C/20: the rated capacity over 20 h")
