@@ -8,7 +8,7 @@
 //! * `/report`: the report of the daemon's store, if this program can make reports.
 //! * On the address of a network, the page and the events need a token ([`Access`]).
 //! * [`http`] limits connections and request heads.
-//! * SIGTERM and SIGINT stop the exporter cleanly.
+//! * the signals of [`Stop`] stop the exporter cleanly.
 
 mod access;
 mod live;

@@ -39,7 +39,7 @@ pub struct CheckProgress {
     pub seconds: f64,
 }
 
-/// Flag that ends the loops; SIGINT and SIGTERM set the flag.
+/// Flag that ends the loops; the signals of [`Stop`] set the flag.
 #[derive(Debug, Clone, Default)]
 pub struct Interrupt(Arc<AtomicBool>);
 

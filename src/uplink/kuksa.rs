@@ -29,7 +29,6 @@ mod value_requests;
 
 use std::time::Duration;
 
-use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::watch;
 use tokio::time::timeout;
 
@@ -83,15 +82,12 @@ async fn serve(settings: &Settings) -> std::io::Result<()> {
     Ok(())
 }
 
-/// Watches for `SIGTERM` and `SIGINT`; the value becomes true with the first signal.
+/// Watches for a signal that ends the program; the value becomes true with the first signal.
 fn stop_requests() -> std::io::Result<watch::Receiver<bool>> {
-    let (mut terminate, mut interrupt) = (signal(SignalKind::terminate())?, signal(SignalKind::interrupt())?);
+    let mut stop = Stop::new(None)?;
     let (sender, receiver) = watch::channel(false);
     tokio::spawn(async move {
-        tokio::select! {
-            _ = terminate.recv() => {}
-            _ = interrupt.recv() => {}
-        }
+        stop.wait().await;
         sender.send_replace(true);
         // The sender must stay alive, because all waits for a stop end when the sender is dropped.
         sender.closed().await;

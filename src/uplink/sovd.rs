@@ -27,7 +27,7 @@ use crate::status_stream::follow;
 use crate::{Failure, Options};
 use resources::Fault;
 
-/// Runs until SIGTERM or SIGINT.
+/// Runs until a signal of [`Stop`].
 ///
 /// # Errors
 /// Fails if the settings are invalid, or if the address cannot be bound.

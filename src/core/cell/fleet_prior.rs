@@ -15,7 +15,7 @@ use nalgebra::DMatrix;
 use serde::{Deserialize, Serialize};
 
 use super::chemistry::curve::{CurvePrior, information};
-use super::chemistry::{Label, ResistanceFactors, SOC, TEMPERATURE_C, TEMPERATURE_NODES, usual_cold_sag_v};
+use super::chemistry::{Label, LabelPrior, ResistanceFactors, SOC, TEMPERATURE_C, TEMPERATURE_NODES, usual_cold_sag_v};
 use super::model::{CellModel, ModelSpread};
 use super::own_model::{OwnModel, SOC_NODES};
 use crate::filter::ScalarGaussian;
@@ -43,6 +43,9 @@ pub struct FleetPrior {
 impl FleetPrior {
     /// Combines the models of the vehicles of one label. `None` without vehicles, or if the label has no model.
     pub fn new(label: &Label, vehicles: &[OwnModel]) -> Option<Self> {
+        if vehicles.is_empty() {
+            return None;
+        }
         let prior = label.prior()?;
         let label_spread = prior.model.spread?;
         let models: Vec<CellModel> = vehicles.iter().map(|own| own.cell_model(label)).collect::<Option<_>>()?;
@@ -114,8 +117,22 @@ impl FleetPrior {
         Some(CurvePrior { soc: SOC.to_vec(), mean_v, covariance, electrodes: label.electrodes })
     }
 
+    /// What is known about the next cell of this label; `None` if the label has no model.
+    pub fn prior(&self) -> Option<LabelPrior> {
+        let of_label = self.label.prior()?;
+        let capacity = self.mean.capacity;
+        Some(LabelPrior {
+            curve: CurvePrior { covariance: self.covariance(), ..of_label.curve },
+            expected: Some(self.mean.clone()),
+            log_resistance_ratio: (self.spread.log_resistance / of_label.model.spread?.log_resistance).min(1.0),
+            cold_sag_std_v: self.mean.cold_sag_v.std(),
+            capacity_std: capacity.std() / capacity.mean,
+            ..of_label
+        })
+    }
+
     /// Covariance of the curve (V^2).
-    pub(super) fn covariance(&self) -> DMatrix<f64> {
+    fn covariance(&self) -> DMatrix<f64> {
         DMatrix::from_fn(SOC_NODES, SOC_NODES, |a, b| self.curve_covariance_v2[a][b])
     }
 

@@ -534,7 +534,7 @@ impl Stages {
         let seconds = Some(now.since(since));
         out.events.push(Event { time: now, kind: EventKind::BusAsleep { asleep: false, seconds } });
         self.sampling.sampler.wake(now);
-        self.sending.restart(now);
+        self.sending.wake(now, since);
     }
 
     /// Whether a reading of this channel ends a bus sleep. A reading of the supply voltage does not, because the

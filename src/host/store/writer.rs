@@ -176,7 +176,7 @@ pub(super) struct Writer {
     pub(super) knows_state: bool,
     /// Whether the next commit must write the state.
     pub(super) needs_state: bool,
-    /// Whether the database was found deleted or replaced while it was open.
+    /// Whether the database was found deleted or replaced while it was open, and the history does not say so yet.
     pub(super) was_replaced: bool,
 }
 
@@ -224,7 +224,7 @@ impl Writer {
                 false
             };
             (progress.ticket, progress.has_room) = (ticket, self.reserve.is_whole());
-            progress.was_replaced |= self.was_replaced;
+            progress.was_replaced |= self.progress.borrow().was_replaced;
             self.progress.send_if_modified(|last| std::mem::replace(last, progress) != progress);
             if stop {
                 return;
@@ -349,6 +349,7 @@ impl Writer {
         if is_replaced {
             tracing::error!(folder = %self.folder, "another program has deleted or replaced the open database");
             (self.database, self.was_replaced) = (None, true);
+            self.progress.send_modify(|progress| progress.was_replaced = true);
         }
         is_replaced
     }
@@ -401,7 +402,7 @@ impl Writer {
             .set_vehicle(&self.vehicle)
             .and_then(|()| database.commit(&[RowBatch { stamp: *now, rows }]))
             .map_err(|error| error.to_string())?;
-        self.knows_state = true;
+        (self.knows_state, self.was_replaced) = (true, false);
         Ok(database)
     }
 }

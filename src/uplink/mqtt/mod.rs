@@ -57,7 +57,7 @@ pub const ONLINE: &str = "online";
 /// Payload of an unavailable state.
 pub const OFFLINE: &str = "offline";
 
-/// Runs until SIGTERM or SIGINT.
+/// Runs until a signal of [`Stop`].
 ///
 /// # Errors
 /// Fails if the settings are invalid or lack the table `[mqtt]`, or if the queue cannot be opened.

@@ -60,8 +60,8 @@ impl FitTask {
     pub fn run(&self) -> FitFindings {
         let is_enough = fit::says_enough(&self.label, &self.rows);
         let nothing = FitFindings { is_before_better: false, is_enough, fit: None, chemistry: None };
-        let Some(prior) = self.label.prior() else { return nothing };
-        let prior = LabelPrior { fleet: self.fleet.clone(), ..prior };
+        let prior = self.fleet.as_ref().map_or_else(|| self.label.prior(), FleetPrior::prior);
+        let Some(prior) = prior else { return nothing };
         let fit = fit::fit(&prior, &self.rows);
         let chemistry = if is_enough { self.better_chemistry(&prior, fit.as_ref()) } else { None };
         FitFindings { is_before_better: self.is_before_better(&prior), fit, chemistry, ..nothing }

@@ -186,6 +186,14 @@ impl Sending {
         self.schedule.is_quiet = is_asleep && is_omitted && now >= self.schedule.quiet_from;
     }
 
+    /// Ends the silence of a sleep that began at `since`.
+    pub(crate) fn wake(&mut self, now: Timestamp, since: Timestamp) {
+        self.restart(now);
+        if let Some(j1939) = &mut self.j1939 {
+            j1939.node.resume_cyclic(now, since);
+        }
+    }
+
     /// Makes all cyclic work due now. Called after a start, a sleep, and a gap.
     pub(crate) fn restart(&mut self, now: Timestamp) {
         self.is_rescheduled = true;

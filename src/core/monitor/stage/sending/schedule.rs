@@ -75,6 +75,7 @@ impl Schedule {
 
     /// Makes all cyclic work due now.
     pub(super) fn restart(&mut self, now: Timestamp) {
+        self.is_quiet = false;
         self.dues().into_iter().for_each(|due| *due = now);
         self.reply = self.reply.min(now);
         self.alarms.restart(now);

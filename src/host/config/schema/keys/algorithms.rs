@@ -300,9 +300,9 @@ section! {
 section! {
     /// Limits for the remaining energy, the times to empty and to full, and the power.
     Outlook at "outlook" gives OutlookConfig, |keys, usable: Option<UsableConfig>, rated_ah: f64| {
-        /// Lowest voltage of a cell under load.
+        /// Lowest voltage of a cell under load. From half of the cell model's lowest voltage to below its highest.
         min_voltage_v: Option<f64>, "V", Above(0.0, 100.0), Optional("the cell model's lowest voltage");
-        /// Highest voltage of a cell under charge.
+        /// Highest voltage of a cell under charge. At most 0.5 V above the cell model's highest.
         max_voltage_v: Option<f64>, "V", Above(0.0, 100.0), Optional("the cell model's highest voltage");
         /// Largest discharge current, per cell.
         max_discharge_a: Option<f64>, "A", Above(0.0, 1e6), Optional("only the voltages limit the current");
