@@ -29,6 +29,7 @@ mod value_requests;
 
 use std::time::Duration;
 
+use packwatch_host::io::stop::Stop;
 use tokio::sync::watch;
 use tokio::time::timeout;
 

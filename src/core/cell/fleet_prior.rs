@@ -149,6 +149,20 @@ impl FleetPrior {
     /// The first impossible number.
     pub fn check(&self) -> Result<(), InvalidState> {
         self.mean.check()?;
+        InvalidState::unless(self.vehicles > 0, "the vehicles of a prior", f64::from(self.vehicles), "at least 1")?;
+        let Label { rated_ah, voltage_min_v, voltage_max_v, .. } = self.label;
+        let capacity_ah = self.mean.capacity.mean;
+        let is_near = (0.4 * rated_ah..=1.4 * rated_ah).contains(&capacity_ah);
+        InvalidState::unless(is_near, "the capacity of a prior", capacity_ah, "0.4 to 1.4 of the rated capacity")?;
+        let mut ends_v = [self.mean.curve_v[0], self.mean.curve_v[SOC_NODES - 1]].into_iter();
+        let beyond = ends_v.find(|v| !(voltage_min_v - 0.5..=voltage_max_v + 0.5).contains(v));
+        let what = "the curve of a prior";
+        InvalidState::unless(
+            beyond.is_none(),
+            what,
+            beyond.unwrap_or_default(),
+            "within 0.5 V of the label's voltages",
+        )?;
         let rows = &self.curve_covariance_v2;
         let is_square = rows.len() == SOC_NODES && rows.iter().all(|row| row.len() == SOC_NODES);
         let what = "the number of rows of the curve's covariance";
@@ -159,7 +173,7 @@ impl FleetPrior {
         InvalidState::unless(is_valid, what, variances[(0, 0)], "symmetric and positive definite")?;
         let ModelSpread { curve_v, log_resistance, slow_branch, capacity, drop_sqrt_s } = self.spread;
         let spreads = [curve_v, log_resistance, slow_branch, capacity, drop_sqrt_s];
-        InvalidState::unless_naturals("a spread between cells", spreads)
+        spreads.into_iter().try_for_each(|spread| InvalidState::unless_positive("a spread between cells", spread))
     }
 }
 

@@ -249,7 +249,7 @@ impl Monitor {
                     stages.sampling.has_second_sender = intake.second_senders().next().is_some();
                     stages.run_housekeeping(now, intake.bus_fault(now, config.interfaces), silence, out);
                 }
-                stages.sending.set_asleep(now, stages.sleep.since.is_some());
+                stages.sending.set_asleep(now, stages.sleep.is_asleep());
                 if stages.sending.take_freshness_due(now) {
                     let freshness = intake.command_gate.announce(now);
                     stages.sending.send_freshness(now, config.commands.as_ref().map(|of| of.bus), freshness, out);

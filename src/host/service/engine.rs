@@ -177,7 +177,7 @@ impl Engine {
         for event in &self.outputs.events {
             self.log.log(event);
             self.readiness.note(event);
-            self.recent.note(event);
+            self.recent.note(Instant::now().into_std(), event);
             self.has_lost_file |= write_or_stop(&mut self.events, "events", |file| event_log::write_line(file, event));
         }
         ticket

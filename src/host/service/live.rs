@@ -157,7 +157,6 @@ impl ServiceLoop {
 
     /// Handles the input that was received before the tick, then the tick. Returns the time of the tick.
     async fn tick(&mut self) -> Timestamp {
-        self.merge_after_stop().await;
         self.drain().await;
         let time = self.clock.now();
         self.ticked = time;
@@ -225,6 +224,7 @@ impl ServiceLoop {
         for _ in 0..INBOX / BATCH {
             // The tasks of the interfaces read from and write to their sockets here.
             tokio::task::yield_now().await;
+            self.merge_after_stop().await;
             while self.batch.len() < BATCH
                 && let Ok(received) = self.inbox.try_recv()
             {

@@ -128,7 +128,8 @@ pub(super) fn export(
     let mut each = |monitor: &Monitor, out: &mut Outputs| {
         if out.events.iter().any(|event| matches!(event.kind, EventKind::Model { .. })) {
             let view = monitor.model();
-            model = view.label.zip(view.own.cloned()).map(|(label, own)| LearnedModel { label, own });
+            let has_prior = view.fleet.is_some();
+            model = view.label.zip(view.own.cloned()).map(|(label, own)| LearnedModel { label, own, has_prior });
         }
         let result = tables.take(monitor, out);
         out.clear();

@@ -189,8 +189,16 @@ impl Stages {
                 estimation.bank.put(index, &estimator);
             }
         }
+        let is_of_other = |&own: &usize| estimation.is_of_other_model(own, &cells[own].model_check);
+        let is_changed = modelling.is_label() && estimation.bank.own_cells().iter().any(is_of_other);
         let stored = cells.iter().map(|cell| (cell.consumed, cell.trusted, cell.model_check));
         estimation.restore(stored, batch);
+        if is_changed {
+            // A resistance is stored relative to its model, so it means nothing with another label or prior.
+            let capacity = learning.state.learner.capacity(estimation.bank.own_cells()[0]);
+            let adoption = modelling.other_model_adoption(estimation.mean_estimate(), capacity);
+            estimation.adopt(&adoption, &mut learning.state.learner, &learning.config.capacity);
+        }
         let configured_a = learning.config.capacity.current_offset_std_a;
         estimation.bank.set_current_offset_std(learning.state.learner.current_offset().std_a(configured_a));
     }

@@ -182,6 +182,9 @@ impl Sending {
 
     /// Omits cyclic frames while the buses sleep, unless they are configured.
     pub(crate) fn set_asleep(&mut self, now: Timestamp, is_asleep: bool) {
+        // A poller receives every frame, so it knows whether a bus sleeps. Between two polls, the inputs are silent on an
+        // awake bus, too.
+        let is_asleep = is_asleep && self.poller.as_ref().is_none_or(|poller| poller.is_bus_asleep(now));
         let is_omitted = self.config.as_ref().is_none_or(|config| !config.while_asleep);
         self.schedule.is_quiet = is_asleep && is_omitted && now >= self.schedule.quiet_from;
     }
