@@ -173,3 +173,20 @@ fn clock_set_back_does_not_stop_sending() {
     queue.restart(Timestamp::ZERO);
     assert!(sent(&mut queue, &engine, 0, 1_500).len() >= 5);
 }
+
+#[test]
+fn restart_after_burst_sends_no_second_burst() {
+    let (mut queue, engine) = (AlarmQueue::default(), engine());
+    for cell in 0..CELLS {
+        queue.note_change(Timestamp::from_secs(10.0), cell_key(cell));
+    }
+    // The state was stored before the first frame.
+    let mut stored = queue.clone();
+    let mut frames = sent(&mut queue, &engine, 10_000, 100).len();
+    assert!(frames > usize::try_from(BURST).unwrap());
+    let now = Timestamp::from_secs(10.1);
+    stored.limit(now, PERIOD_S);
+    stored.restart(now);
+    frames += sent(&mut stored, &engine, 10_100, 900).len();
+    assert!(frames <= 101 + usize::try_from(BURST).unwrap(), "{frames} frames in a second");
+}
