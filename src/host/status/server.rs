@@ -20,6 +20,7 @@ use super::document::StatusDocument;
 use super::{MAX_SILENCE, MODE, SLOTS, STALE, daemon_path, stream_path};
 use crate::io::connection_slots::{Activity, ConnectionSlots, LocalProcess};
 use crate::io::place::PlaceSetting;
+use crate::io::runtime::new_runtime;
 use crate::io::unix_socket::{BindError, BoundSocket, bind};
 use crate::monitor::Event;
 
@@ -148,7 +149,7 @@ fn run(
     drafts: mpsc::Receiver<Box<Draft>>,
     ready: &SyncSender<Result<(), BindError>>,
 ) {
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
+    let runtime = new_runtime();
     let served = runtime.map_err(BindError::Io).and_then(|runtime| {
         runtime.block_on(async {
             let once = bind(&path, MODE).await?;
