@@ -12,6 +12,8 @@ mod pending_answers;
 pub mod readiness;
 mod reload;
 mod status_publisher;
+#[cfg(test)]
+mod world;
 
 use std::io;
 use std::path::PathBuf;
