@@ -205,6 +205,8 @@ struct World {
     standby: bool,
     /// Whether the files were changed from outside since the start.
     tampered: bool,
+    /// Steps since the last start or frame.
+    silent_steps: u32,
     silent_until: i64,
     soc: f64,
     current_a: f64,
@@ -231,6 +233,7 @@ impl World {
             requests: VecDeque::new(),
             standby: false,
             tampered: false,
+            silent_steps: 0,
             silent_until: 0,
             soc: 0.8,
             current_a: 0.0,
@@ -281,8 +284,11 @@ impl World {
             assert!(progress.rows >= self.rows, "{} rows were confirmed, {} are there", self.rows, progress.rows);
             assert!(progress.works, "the store works");
         }
+        // A damaged state may have lost the command.
+        self.standby &= !self.tampered;
         (self.rows, self.tampered) = (progress.rows, false);
         (self.engine, self.next_frame) = (Some(engine), Box::new(next_frame));
+        self.silent_steps = 0;
         self.counts.starts += 1;
     }
 
@@ -291,9 +297,16 @@ impl World {
         let before = self.state();
         self.generation += 1;
         copy(&before, &self.state());
-        // Whatever the dying process still writes goes to the old folder.
-        drop(self.engine.take());
-        fs::remove_dir_all(before).unwrap();
+        self.discard(&before);
+    }
+
+    /// Ends the process. What it still writes goes to a folder that nobody reads.
+    fn discard(&mut self, folder: &Path) {
+        let now = self.now();
+        if let Some(mut engine) = self.engine.take() {
+            engine.close_store(now);
+        }
+        fs::remove_dir_all(folder).unwrap();
     }
 
     /// Passes a record to the daemon, and handles what it sends. `is_cut` kills the process before the commit.
@@ -305,8 +318,13 @@ impl World {
         });
         let (now, now_ns) = (self.now(), self.now_ns);
         let Some(engine) = &mut self.engine else { return };
+        let was_asleep = engine.monitor.asleep_since().is_some();
         let ticket = engine.handle(record);
-        let asleep = engine.monitor.asleep_since().is_some();
+        // After a start or a frame, the program must first observe the silence itself.
+        if matches!(record.kind, RecordKind::Frame { .. }) {
+            self.silent_steps = 0;
+        }
+        let asleep = self.silent_steps > 100 && was_asleep && engine.monitor.asleep_since().is_some();
         let executed = engine.outputs.events.iter().any(|event| {
             matches!(event.kind, EventKind::Command { source: Source::Bus(_), command: Command::Acknowledge(_), .. })
         });
@@ -320,8 +338,7 @@ impl World {
             if ticket.is_some() {
                 // The commit did not reach the disk, and what it announces was not sent.
                 self.check_sent(now_ns, asleep, was_standby);
-                drop(self.engine.take());
-                fs::remove_dir_all(self.state()).unwrap();
+                self.discard(&self.state());
                 self.generation += 1;
                 fs::rename(kept, self.state()).unwrap();
                 self.standby = was_standby;
@@ -343,7 +360,7 @@ impl World {
         if ticket.is_some() {
             self.settle(now);
         }
-        self.check_sent(now_ns, asleep, was_standby || self.standby);
+        self.check_sent(now_ns, asleep, was_standby && self.standby);
     }
 
     fn settle(&mut self, now: Timestamp) {
@@ -416,6 +433,7 @@ impl World {
 
     fn step(&mut self) {
         self.counts.steps += 1;
+        self.silent_steps += 1;
         self.drive();
         let is_cut = self.dice.one_in(500);
         self.now_ns += STEP_NS;
