@@ -18,7 +18,7 @@ use crate::cell::LossModes;
 use crate::cell_faults::{CellFault, Difference};
 use crate::filter::ScalarGaussian;
 use crate::health::outlook::Outlook;
-use crate::health::{InsufficientData, PackState, RemainingLife};
+use crate::health::{InsufficientData, PackState, RemainingLife, UseRecord};
 use crate::quantity::catalogue::{CellValues, Estimate, PackValues, Quantity, RECORDED, Values};
 use crate::quantity::{BusIndex, CellIndex, Channel, Mode, Timestamp};
 use crate::sample::ReadingCounts;
@@ -212,6 +212,11 @@ impl Monitor {
         self.stages.learning.lives.of_pack()
     }
 
+    /// How the connected pack was used.
+    pub fn use_record(&self) -> &UseRecord {
+        self.stages.learning.state.use_counter.record()
+    }
+
     /// The alarm engine with the raised alarms.
     pub fn alarms(&self) -> &AlarmEngine {
         &self.stages.alarming.engine
@@ -263,7 +268,7 @@ impl Monitor {
         let weakest = learning.weakest();
         let weakest_cell = weakest.and_then(|(index, _)| estimation.cell_indices().nth(index));
         let capacity = weakest.map(|(_, capacity)| capacity);
-        let hottest = sampler.hottest_c(now);
+        let sensors = sampler.temperature_range_c(now);
         let soc = pack.map(|pack| ScalarGaussian::from_std(pack.soc, pack.soc_std));
         let edge = |sign: f64| soc.map(|soc| (soc.mean + sign * Z95 * soc.std()).clamp(0.0, 1.0));
         let usable = health.usable_capacity_ah.zip(health.usable_capacity_std_ah);
@@ -281,7 +286,7 @@ impl Monitor {
         values.set(Quantity::Voltage, sampling.pack_voltage_v(estimation.cell_indices(), now));
         values.set(Quantity::Current, sampler.pack_current_a(now));
         values.set(Quantity::CurrentOffset, self.current_offset());
-        values.set(Quantity::TemperatureMax, hottest.and_then(|(hottest_c, is_whole)| is_whole.then_some(hottest_c)));
+        values.set(Quantity::TemperatureMax, sensors.filter(|it| it.is_whole).map(|it| it.highest));
         values.set(Quantity::Capacity, capacity);
         values.set(Quantity::UsableCapacity, usable.map(|(mean, std)| Estimate { mean, std: Some(std) }));
         values.set(Quantity::Soh, soh);
@@ -303,6 +308,7 @@ impl Monitor {
             model_state: Some(model.state),
             model_fits_better: model.chemistry,
             moved: Some(learning.state.moved.sums),
+            use_record: Some(*self.use_record()),
             values,
         }
     }
