@@ -298,6 +298,7 @@ impl Monitor {
         values.set(Quantity::EnergySoh, self.stages.energy_soh());
         let outlook = self.stages.outlook();
         set_outlook(&mut values, outlook.as_ref());
+        set_use(&mut values, self.use_record());
         PackView {
             validity: self.stages.validity(),
             mode: learning.mode(),
@@ -330,6 +331,16 @@ fn set_outlook(values: &mut PackValues, outlook: Option<&Outlook>) {
         set(discharge, outlook.map(|it| it.discharge_w[k]));
         set(charge, outlook.map(|it| it.charge_w[k]));
     }
+}
+
+/// Sets the counts of use. A count is unknown until it could have been above 0.
+fn set_use(values: &mut PackValues, record: &UseRecord) {
+    let UseRecord { temperature_c, voltage_v, current_a, half_cycles, rest, .. } = record;
+    let is_judged = [temperature_c, voltage_v, current_a].iter().any(|it| it.below.known_s + it.above.known_s > 0.0);
+    let number = |count: u64, is_known: bool| is_known.then_some(count as f64);
+    values.set(Quantity::LimitEvents, number(record.events(), is_judged));
+    values.set(Quantity::FastCharges, number(half_cycles.fast_charges, half_cycles.charges > 0));
+    values.set(Quantity::HighSocTime, (rest.known_s > 0.0).then_some(rest.above_80_s));
 }
 
 fn set_losses<const IS_PACK: bool>(values: &mut Values<IS_PACK>, losses: Option<LossModes>) {

@@ -54,7 +54,7 @@ pub struct PackView {
     #[serde(default)]
     pub moved: Option<MovedSums>,
     /// How the pack was used while the program ran with it; `None` in documents of earlier versions.
-    #[serde(default, rename = "use")]
+    #[serde(default)]
     pub use_record: Option<UseRecord>,
     /// Values of the pack.
     #[serde(flatten)]
