@@ -34,6 +34,7 @@ pub const C_RATE_EDGES: [f64; 4] = [0.5, 1.0, 2.0, 3.0];
 
 /// Time and events beyond one limit.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(default)]
 pub struct LimitUse {
     /// Time in which a limit was configured and it was known whether the value was beyond the limit (s).
     pub known_s: f64,
@@ -47,6 +48,7 @@ pub struct LimitUse {
 
 /// Use of a value that has a lower and an upper limit.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(default)]
 pub struct RangeUse {
     /// Below the lower limit.
     pub below: LimitUse,
@@ -62,6 +64,7 @@ pub struct RangeUse {
 
 /// Time by C-rate: up to 0.5, 1, 2 and 3 C, and above 3 C (s).
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(default)]
 pub struct CRateUse {
     /// Time with a current within the dead band of `[transition]` (s).
     pub rest_s: f64,
@@ -73,6 +76,7 @@ pub struct CRateUse {
 
 /// Half-cycles by kind.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(default)]
 pub struct HalfCycleUse {
     /// Number of discharges by depth, in tenths of the rated capacity. The last number includes deeper discharges.
     pub discharges: [u64; 10],
@@ -86,6 +90,7 @@ pub struct HalfCycleUse {
 
 /// Rest at a high SOC.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(default)]
 pub struct RestUse {
     /// Time at rest with a known SOC (s).
     pub known_s: f64,
@@ -99,6 +104,7 @@ pub struct RestUse {
 
 /// How a pack was used since the program first ran with it.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(default)]
 pub struct UseRecord {
     /// Temperatures of the sensors (degrees C).
     pub temperature_c: RangeUse,

@@ -110,7 +110,7 @@ impl Condition {
             ("discharging current above its limit", current_a.above),
         ];
         let counted = limits.into_iter().filter(|(_, limit)| limit.events > 0);
-        let text = |what: &str, limit: LimitUse| format!("{what}: {} events, {:.0} s", limit.events, limit.beyond_s);
+        let text = |what: &str, limit: LimitUse| format!("{what}: {} x, {:.0} s", limit.events, limit.beyond_s);
         counted.map(|(what, limit)| (text(what, limit), self.time)).collect()
     }
 

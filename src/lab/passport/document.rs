@@ -25,9 +25,8 @@ pub fn passport(standard: Standard, condition: &Condition, manufacturer: Value) 
         return Err(vec!["static part: must be an object".to_owned()]);
     };
     let mut faults = Vec::new();
-    let known: Vec<(Field, Place, Quantity)> = places(standard)
-        .filter_map(|(field, place)| Some((field, place, condition.get(field).ok()?)))
-        .collect();
+    let known: Vec<(Field, Place, Quantity)> =
+        places(standard).filter_map(|(field, place)| Some((field, place, condition.get(field).ok()?))).collect();
     for (index, (field, place, quantity)) in known.iter().enumerate() {
         faults.extend(insert(&mut root, place.group, place.value, field.number(quantity.value)).err());
         if known[..index].iter().any(|(_, before, _)| before.group == place.group) {
