@@ -86,16 +86,6 @@ fn packwatch(folder: &Path, args: &[&str]) {
 fn report_export_and_passport_show_use_of_a_replay() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
-    let mut log = String::from("time_s,current_a,voltage_v,temperature_c\n");
-    let mut soc = 0.9;
-    for second in 0..3900 {
-        let current_a = current_a(second);
-        soc -= current_a / 3600.0 / 2.0;
-        let voltage_v = 3.3 + 0.8 * soc - 0.05 * current_a;
-        let temperature_c = temperature_c(second);
-        log += &format!("{},{current_a},{voltage_v:.4},{temperature_c}\n", 1_700_000_000 + second);
-    }
-    fs::write(folder.join("cell.csv"), log).unwrap();
     fs::write(folder.join("accidents.json"), r#"{ "InformationOnAccidents": [] }"#).unwrap();
     let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
     let mut config = fs::read_to_string(shipped.join("measured.toml")).unwrap();
@@ -103,6 +93,18 @@ fn report_export_and_passport_show_use_of_a_replay() {
         config = config.replace(&format!("\"{name}\""), &format!("{:?}", shipped.join(name)));
     }
     fs::write(folder.join("pack.toml"), config + LIMITS).unwrap();
+    let model = packwatch::config::load(&folder.join("pack.toml")).unwrap_or_else(|faults| panic!("{faults:?}"));
+    let model = model.monitor.model;
+    let mut log = String::from("time_s,current_a,voltage_v,temperature_c\n");
+    let mut soc = 0.9;
+    for second in 0..3900 {
+        let (current_a, temperature_c) = (current_a(second), temperature_c(second));
+        soc -= current_a / 3600.0 / model.capacity_ah;
+        let position = model.grid_position(soc, temperature_c);
+        let voltage_v = model.ocv_v(&position) - current_a * model.settled_ohm(&position);
+        log += &format!("{},{current_a},{voltage_v:.4},{temperature_c}\n", 1_700_000_000 + second);
+    }
+    fs::write(folder.join("cell.csv"), log).unwrap();
     packwatch(folder, &["replay", "-c", "pack.toml", "--state", "state", "cell.csv"]);
     packwatch(folder, &["report", "--state", "state", "-o", "report.html"]);
     packwatch(folder, &["export", "-c", "pack.toml", "--format", "csv", "-o", "out", "cell.csv"]);
