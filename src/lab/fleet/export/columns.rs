@@ -283,7 +283,7 @@ pub fn reference() -> String {
     page += &section("alarms", "A change of an alarm.", ALARMS);
     page += &section(
         "use_record",
-        "A known number of the record of use (status document, `pack.use_record`) of the pack that is connected at the end of the log.",
+        "A known number of the record of use (`use_record` in the status document) of the pack that is connected at the end of the log.",
         USE_RECORD,
     );
     page += &section("vehicles", "A vehicle of a fleet, written by `packwatch fleet merge`.", VEHICLES);
