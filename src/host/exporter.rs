@@ -33,6 +33,7 @@ use self::access::{Access, Decision};
 use self::live::{AnswerBody, Live};
 use super::http::{self, Bytes, Full, Incoming, Request, Response, StatusCode, answer_with, reads, with};
 use super::io::connection_slots::Activity;
+use super::io::runtime::new_runtime;
 use super::io::stop::Stop;
 use super::service::notify;
 use super::status::metrics::{openmetrics, prometheus_text};
@@ -66,8 +67,7 @@ struct Site {
 /// # Errors
 /// Fails if the token cannot be read, or if the address cannot be bound.
 pub fn run(listen: SocketAddr, socket: &Path, token_file: Option<&Path>, report: ReportMaker) -> Result<(), String> {
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
-    let runtime = runtime.map_err(|error| format!("cannot start: {error}"))?;
+    let runtime = new_runtime().map_err(|error| format!("cannot start: {error}"))?;
     let access = Access::new(listen.ip(), token_file)?;
     let site = Site::new(access, report);
     let served = async { serve(TcpListener::bind(listen).await?, Rc::new(site), socket.to_owned()).await };

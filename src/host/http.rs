@@ -56,7 +56,9 @@ where
     B: Body + 'static,
     B::Error: Into<Box<dyn Error + Send + Sync>>,
 {
-    let mut places = ConnectionSlots::new(SlotLimits { total: MAX_CONNECTIONS, per_client: MAX_PER_ADDRESS });
+    let limits =
+        SlotLimits { total: MAX_CONNECTIONS, for_root: 0, per_user: MAX_CONNECTIONS, per_client: MAX_PER_ADDRESS };
+    let mut places = ConnectionSlots::new(limits);
     let mut connections = JoinSet::new();
     loop {
         let accepted = tokio::select! {

@@ -310,6 +310,15 @@ impl Store {
         }
     }
 
+    /// Waits until the writer has handled everything that was queued.
+    #[cfg(test)]
+    pub(crate) fn settle(&self) -> StoreProgress {
+        while self.progress.borrow().ticket < self.write_queue.submitted() {
+            std::thread::sleep(Duration::from_micros(50));
+        }
+        *self.progress.borrow()
+    }
+
     /// Queues rows and the state for the writer. Returns the ticket.
     fn submit(&mut self, HistoryCommit { rows, with_state }: HistoryCommit, monitor: &Monitor, now: Timestamp) -> u64 {
         let state = self.document(monitor, now);

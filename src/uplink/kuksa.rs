@@ -29,6 +29,7 @@ mod value_requests;
 
 use std::time::Duration;
 
+use packwatch_host::io::runtime::new_runtime;
 use packwatch_host::io::stop::Stop;
 use tokio::sync::watch;
 use tokio::time::timeout;
@@ -49,8 +50,7 @@ pub(crate) const LONGEST_PAUSE: Duration = Duration::from_secs(8);
 /// Fails if the settings are invalid or the runtime cannot be started.
 pub fn run(options: &Options) -> Result<(), Failure> {
     let settings = options.start()?;
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
-    let runtime = runtime.map_err(|error| Failure::new(format!("runtime: {error}")))?;
+    let runtime = new_runtime().map_err(|error| Failure::new(format!("runtime: {error}")))?;
     runtime.block_on(serve(&settings)).map_err(|error| Failure::new(format!("signals: {error}")))
 }
 

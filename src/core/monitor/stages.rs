@@ -28,6 +28,7 @@ use crate::can::encode::{HealthFields, StatusFields};
 use crate::can::poll::CarState;
 use crate::filter::ScalarGaussian;
 use crate::health::ModeChange;
+use crate::quantity::catalogue::PackValues;
 use crate::quantity::{BusIndex, CellIndex, Channel, Mode, Reading, Timestamp};
 use crate::sample::{CellSample, Moment};
 
@@ -458,8 +459,13 @@ impl Stages {
             self.sending.send_status(now, &fields, out);
         }
         if is_health_due {
+            let mut outlook = PackValues::default();
+            if self.sending.has_outlook() {
+                let _ = self.set_outlook(&mut outlook);
+            }
             let fields = HealthFields {
                 model_state: Some(self.modelling.view().state.code()),
+                outlook,
                 ..self.learning.health_fields(&self.estimation.bank)
             };
             self.sending.send_health(now, &fields, out);

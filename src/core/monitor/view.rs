@@ -17,7 +17,6 @@ use crate::can::poll::PollSilence;
 use crate::cell::LossModes;
 use crate::cell_faults::{CellFault, Difference};
 use crate::filter::ScalarGaussian;
-use crate::health::outlook::Outlook;
 use crate::health::{InsufficientData, PackState, RemainingLife, UseRecord};
 use crate::quantity::catalogue::{CellValues, Estimate, PackValues, Quantity, RECORDED, Values};
 use crate::quantity::{BusIndex, CellIndex, Channel, Mode, Timestamp};
@@ -296,14 +295,13 @@ impl Monitor {
         set_losses(&mut values, weakest_cell.and_then(|cell| self.loss_modes(cell)));
         set_remaining_life(&mut values, life.map(|(_, life)| life));
         values.set(Quantity::EnergySoh, self.stages.energy_soh());
-        let outlook = self.stages.outlook();
-        set_outlook(&mut values, outlook.as_ref());
+        let power_limiting_cells = self.stages.set_outlook(&mut values);
         set_use(&mut values, self.use_record());
         PackView {
             validity: self.stages.validity(),
             mode: learning.mode(),
             limiting_cell: pack.map(|pack| pack.limiting_cell),
-            power_limiting_cells: outlook.map(|outlook| outlook.limiting_cells),
+            power_limiting_cells,
             weakest_cell,
             shortest_lived_cell: life.map(|(cell, _)| cell),
             model_state: Some(model.state),
@@ -312,24 +310,6 @@ impl Monitor {
             use_record: Some(*self.use_record()),
             values,
         }
-    }
-}
-
-fn set_outlook(values: &mut PackValues, outlook: Option<&Outlook>) {
-    use Quantity as Q;
-    let mut set = |quantity, value: Option<ScalarGaussian>| values.set(quantity, value);
-    set(Q::RemainingEnergy, outlook.map(|it| it.remaining_wh));
-    set(Q::EnergyToFull, outlook.map(|it| it.to_full_wh));
-    set(Q::TimeToEmpty, outlook.and_then(|it| it.to_empty_s));
-    set(Q::TimeToFull, outlook.and_then(|it| it.to_full_s));
-    set(Q::TimeToTarget, outlook.and_then(|it| it.to_target_s));
-    let powers = [
-        [Q::DischargePower2s, Q::DischargePower10s, Q::DischargePower30s],
-        [Q::ChargePower2s, Q::ChargePower10s, Q::ChargePower30s],
-    ];
-    for (k, [discharge, charge]) in (0..3).map(|k| (k, powers.map(|times| times[k]))) {
-        set(discharge, outlook.map(|it| it.discharge_w[k]));
-        set(charge, outlook.map(|it| it.charge_w[k]));
     }
 }
 

@@ -10,8 +10,8 @@ use tokio::task::JoinSet;
 use tokio::time::timeout;
 
 use super::protocol::{Answer, Request};
-use super::{MAX_CONNECTIONS, MAX_PER_PROCESS, MAX_REQUEST_BYTES, MAX_SILENCE, MODE, daemon_path};
-use crate::io::connection_slots::{Activity, ConnectionSlots, SlotLimits};
+use super::{MAX_CONNECTIONS, MAX_REQUEST_BYTES, MAX_SILENCE, MODE, SLOTS, daemon_path};
+use crate::io::connection_slots::{Activity, ConnectionSlots, LocalProcess};
 use crate::io::event_log::command_words;
 use crate::io::place::PlaceSetting;
 use crate::io::unix_socket::{BoundSocket, SocketFile, bind};
@@ -76,7 +76,7 @@ struct ConnectionContext {
 }
 
 async fn accept(listener: UnixListener, context: ConnectionContext) {
-    let mut places = ConnectionSlots::new(SlotLimits { total: MAX_CONNECTIONS, per_client: MAX_PER_PROCESS });
+    let mut places = ConnectionSlots::new(SLOTS);
     let mut connections = JoinSet::new();
     loop {
         while connections.try_join_next().is_some() {}
@@ -95,14 +95,15 @@ async fn accept(listener: UnixListener, context: ConnectionContext) {
                 continue;
             }
         };
-        if !places.make_room(&peer.pid(), Instant::now()) {
+        let client = LocalProcess::from(&peer);
+        if !places.make_room(&client, Instant::now()) {
             refuse(&stream);
             continue;
         }
         let (context, activity) = (context.clone(), Activity::new());
         let of_task = activity.clone();
         let task = connections.spawn(async move { serve_connection(stream, peer, &context, &of_task).await });
-        places.take(peer.pid(), activity, task);
+        places.take(client, activity, task);
     }
 }
 

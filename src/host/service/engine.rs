@@ -267,6 +267,22 @@ impl Engine {
         }
     }
 
+    /// Queues a checkpoint.
+    #[cfg(test)]
+    pub(super) fn write_checkpoint(&mut self, time: Timestamp) {
+        if let Some(store) = &mut self.store {
+            store.write_start(&self.monitor, time);
+        }
+    }
+
+    /// Waits until everything queued is on disk, and handles the result.
+    #[cfg(test)]
+    pub(super) fn settle_store(&mut self, time: Timestamp) -> Option<StoreProgress> {
+        let progress = self.store.as_ref()?.settle();
+        self.handle_store_progress(progress, time);
+        Some(progress)
+    }
+
     /// Writes the last state to disk.
     pub(super) fn close_store(&mut self, time: Timestamp) {
         if let Some(store) = self.store.take() {

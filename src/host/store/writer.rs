@@ -124,6 +124,12 @@ impl WriteQueue {
         self.wake.notify_one();
     }
 
+    /// Ticket of the last submission.
+    #[cfg(test)]
+    pub(super) fn submitted(&self) -> u64 {
+        self.lock().ticket
+    }
+
     /// Number of rows that were dropped for lack of room and are not yet reported in the history.
     pub(super) fn lost_rows(&self) -> u64 {
         self.lock().backlog.lost()

@@ -152,7 +152,8 @@ impl Stages {
             self.sending.schedule.set_quiet_from(now.plus_secs(after_s));
         }
         self.sleep.since = snapshot.asleep_since;
-        self.restore_alarms(now, &snapshot.alarming.alarms, is_continued, out);
+        let stored = (!is_continued).then_some(snapshot.time);
+        self.restore_alarms(now, &snapshot.alarming.alarms, stored, out);
         if is_continued {
             self.alarming.resume(&snapshot.alarming);
             self.sending.resume(&snapshot.sending);
@@ -241,15 +242,15 @@ impl Stages {
         self.publisher(now, out).publish_alarms();
     }
 
-    /// Restores the stored alarms. Alarms without a configured threshold end, and receivers on the bus are notified.
-    fn restore_alarms(&mut self, time: Timestamp, state: &AlarmSnapshot, is_continued: bool, out: &mut Outputs) {
+    /// Restores the alarms stored at `stored`; `None` = the run goes on without a break. Alarms without a configured threshold end, and receivers on the bus are notified.
+    fn restore_alarms(&mut self, time: Timestamp, state: &AlarmSnapshot, stored: Option<Timestamp>, out: &mut Outputs) {
         self.alarming.state.knows_all_valid = false;
         let orphans = self.alarming.engine.restore(time, state);
-        if !is_continued {
+        if let Some(stored) = stored {
             self.sending.compare_first(time);
-            self.sending.skip_counters(time, &self.alarming.engine);
+            self.sending.skip_counters(stored, time, &self.alarming.engine);
         }
-        let has_changed = !is_continued || !orphans.is_empty();
+        let has_changed = stored.is_some() || !orphans.is_empty();
         for orphan in orphans {
             let StoredAlarm { rule, severity, cell, .. } = orphan;
             let (active, occurrences) = (orphan.is_raised(), orphan.occurrences());

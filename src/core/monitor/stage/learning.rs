@@ -472,7 +472,7 @@ impl Learning {
             lli: part(|losses| &losses.lithium),
             lam_ne: part(|losses| &losses.negative),
             lam_pe: part(|losses| &losses.positive),
-            model_state: None,
+            ..HealthFields::default()
         }
     }
 }

@@ -197,6 +197,11 @@ impl Sending {
         }
     }
 
+    /// Whether the health frame contains energy, time or power.
+    pub(crate) fn has_outlook(&self) -> bool {
+        self.config.as_ref().is_some_and(|config| config.plan.has_outlook())
+    }
+
     /// Makes all cyclic work due now. Called after a start, a sleep, and a gap.
     pub(crate) fn restart(&mut self, now: Timestamp) {
         self.is_rescheduled = true;
@@ -205,7 +210,7 @@ impl Sending {
 
     /// Skips the counters of all frames that an earlier process sent after its state was stored, or would have sent by
     /// `now`. To receivers, the frames of the downtime then look lost, and no counter repeats.
-    pub(crate) fn skip_counters(&mut self, now: Timestamp, engine: &AlarmEngine) {
+    pub(crate) fn skip_counters(&mut self, stored: Timestamp, now: Timestamp, engine: &AlarmEngine) {
         let Some(config) = &self.config else { return };
         let Schedule { status, health, alarm, digest, alarms, counters, .. } = &mut self.schedule;
         let periods = |due: Timestamp, period_s: f64| {
@@ -216,7 +221,7 @@ impl Sending {
         let pages = |count: usize| u64::try_from(count).unwrap_or(0);
         // The queue still holds the alarms that the earlier process announced as unknown.
         let unknown = u64::from(alarms.has_unknown()) * periods(*alarm, config.alarm_period_s);
-        alarms.limit(now, config.alarm_period_s);
+        alarms.limit(stored, now, config.alarm_period_s);
         for (message, frames) in [
             (LayoutMessage::Status, periods(*status, config.status_period_s)),
             (

@@ -59,6 +59,8 @@ section! {
         dbc: Option<String>, "", NotEmpty, Optional("built-in `packwatch.dbc`, with an Ah resolution that fits the cell");
         /// Whether cyclic frames (also DM1 and the freshness announcement) are sent while the buses sleep (`input.asleep_after_s`). Cyclic frames can keep other nodes awake and drain the 12 V battery. Alarm changes, replies and tests are sent in both cases.
         while_asleep: bool, "", Any, Default("false");
+        /// Whether the health frame also has the pages 5 to 12: energy, time and power with their standard deviations (`[outlook]`).
+        outlook: bool, "", Any, Default("false");
     }
 }
 

@@ -160,7 +160,7 @@ fn stored_times_far_ahead_do_not_stop_sending() {
     sent(&mut queue, &engine, 0, 2_000);
     queue.note_change(Timestamp::from_secs(2.0), cell_key(1));
     queue.rebase(i64::MAX / 2);
-    queue.limit(Timestamp::from_secs(2.0), PERIOD_S);
+    queue.limit(Timestamp::from_secs(2.0), Timestamp::from_secs(2.0), PERIOD_S);
     assert!(sent(&mut queue, &engine, 2_000, 1_500).len() >= 5);
 }
 
@@ -185,7 +185,7 @@ fn restart_after_burst_sends_no_second_burst() {
     let mut frames = sent(&mut queue, &engine, 10_000, 100).len();
     assert!(frames > usize::try_from(BURST).unwrap());
     let now = Timestamp::from_secs(10.1);
-    stored.limit(now, PERIOD_S);
+    stored.limit(Timestamp::from_secs(10.0), now, PERIOD_S);
     stored.restart(now);
     frames += sent(&mut stored, &engine, 10_100, 900).len();
     assert!(frames <= 101 + usize::try_from(BURST).unwrap(), "{frames} frames in a second");
