@@ -76,6 +76,7 @@
 //! | the signature of a cell fault | `core/cell_faults/difference.rs`, `core/cell_faults/channels.rs` |
 //! | when a cell fault is reported | `core/cell_faults/fault.rs` |
 //! | capacity learned from a half-cycle | `core/health/learner.rs` |
+//! | how a pack is used: limits, C-rates, fast charges | `core/health/use_record.rs` (counters), `core/monitor/stages/use_record.rs` (values, limits) |
 //! | learned values of packs that were exchanged | `core/monitor/stages/pack_memory.rs` |
 //! | contents of the stored state | the state of the stage, `core/monitor/snapshot.rs`, `core/monitor/lifecycle/restore.rs` (restore) |
 //! | a configuration key | `host/config/schema/keys/` (files `pack`, `input`, `limits`, `algorithms`, `traffic`), `host/config/mod.rs` (list of the steps) |

@@ -15,7 +15,7 @@ use parquet::file::reader::{FileReader, SerializedFileReader};
 use parquet::record::RowAccessor;
 use serde_json::Value;
 
-const TABLES: [&str; 4] = ["vehicles", "half_cycles", "alarms", "estimates"];
+const TABLES: [&str; 5] = ["vehicles", "half_cycles", "alarms", "use_record", "estimates"];
 
 struct Fleet {
     folder: tempfile::TempDir,

@@ -54,6 +54,10 @@ pub struct OutlookConfig {
     pub max_discharge_a: Option<f64>,
     /// Largest current of a charge (A); `None` = only the voltages limit it.
     pub max_charge_a: Option<f64>,
+    /// Lowest temperature of the pack (degrees C); `None` = unknown. It limits only what counts as use within limits.
+    pub min_temperature_c: Option<f64>,
+    /// Highest temperature of the pack (degrees C); `None` = unknown. It limits only what counts as use within limits.
+    pub max_temperature_c: Option<f64>,
     /// A charge is complete when its current has fallen to this value (A).
     pub taper_current_a: f64,
     /// SOC for which the time of a charge is stated, fraction.

@@ -5,6 +5,7 @@
 
 mod outlook;
 pub(crate) mod pack_memory;
+mod use_record;
 pub(crate) mod watch;
 
 use pack_memory::PackMemory;
@@ -393,6 +394,7 @@ impl Stages {
             self.complete_mode(now, change, out);
         }
         self.learning.state.learned_at = None;
+        self.learning.state.use_counter.interrupt();
     }
 
     /// Continues at `time` after a gap of unknown length.
@@ -434,6 +436,7 @@ impl Stages {
         self.estimation.is_current_doubtful = self.sampling.has_second_sender || is_current_frozen || is_contradicted;
         self.findings.watch_current(now, is_current_frozen, out);
         if is_judged {
+            self.count_use(now);
             self.watch(now, out);
         }
         self.watch_computer(now, bus_fault, out);

@@ -122,6 +122,7 @@ const fn measure(unit: Unit) -> (Measure, f64) {
         Unit::Seconds => ("s", "duration", 0, 1.0),
         Unit::Days => ("d", "duration", 1, 1.0),
         Unit::Cycles => ("cycles", "", 1, 1.0),
+        Unit::Count => ("", "", 0, 1.0),
     };
     (Measure { unit, class, decimals }, factor)
 }

@@ -195,6 +195,12 @@ fn health(raw: &RawTables, model: Option<&CellModel>) {
             estimator.place.fault("capacity_state", format!("must be \"{needed}\" with capacity.method = \"{key}\""));
         }
     }
+    if let Some(outlook) = &raw.outlook
+        && let (Some(min_c), Some(max_c)) = (outlook.min_temperature_c, outlook.max_temperature_c)
+        && max_c <= min_c
+    {
+        outlook.place.fault("max_temperature_c", format!("must be above min_temperature_c = {min_c}"));
+    }
     // If the model's own range is invalid, only the model's fault is reported.
     let has_range = |model: &&CellModel| model.voltage_min_v < model.voltage_max_v;
     if let (Some(outlook), Some(model)) = (&raw.outlook, model.filter(has_range)) {
