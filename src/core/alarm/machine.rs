@@ -309,8 +309,11 @@ impl Machine {
 
     /// Whether the alarm may end now. If so, counts the end.
     fn take_end(&mut self, now: Timestamp) -> bool {
+        let latest = now.plus_secs(QUICK_ENDS as f64 * END_PERIOD_S);
+        // After a backward step of the clock, the stored time may be far ahead.
+        self.rested_at = self.rested_at.min(latest);
         let rested_at = self.rested_at.max(now).plus_secs(END_PERIOD_S);
-        let is_allowed = rested_at <= now.plus_secs(QUICK_ENDS as f64 * END_PERIOD_S);
+        let is_allowed = rested_at <= latest;
         if is_allowed {
             self.rested_at = rested_at;
         }

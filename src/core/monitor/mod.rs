@@ -388,6 +388,7 @@ impl Monitor {
             TimeJump::Backwards { seconds } => {
                 self.stages.step_waiting(self.clock.now, true, out);
                 out.events.push(Event { time, kind: EventKind::TimeBackwards { seconds } });
+                self.stages.sending.schedule.step_back(seconds);
                 self.handle_unknown_gap(time, out);
             }
             TimeJump::Asleep { seconds } => {

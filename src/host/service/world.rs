@@ -383,7 +383,7 @@ impl World {
                 assert!(freshness > self.freshness, "freshness {freshness} after {}", self.freshness);
                 self.freshness = freshness;
             }
-            assert!(!(is_asleep && CYCLIC.contains(&id)), "{id:#X} was sent on a sleeping bus");
+            assert!(!(is_asleep && CYCLIC.contains(&id)), "{id:#X} was sent on a sleeping bus, {} steps", self.silent_steps);
             assert!(!(is_standby && id == 0x79B), "a request was sent in standby");
             let times = if id == ALARM { &mut self.alarms } else { &mut self.requests };
             if id == ALARM || id == 0x79B {

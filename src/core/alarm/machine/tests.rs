@@ -331,5 +331,11 @@ fn flickering_alarm_stays_raised_and_changes_seldom() {
             (86_401..87_100).filter_map(|s| observe(&mut machine, &rule, f64::from(s), LimitCheck::Healthy)).collect();
         assert_eq!(after.last(), Some(&Change::Cleared), "{after:?}");
         assert!(!machine.state.is_raised());
+        // A backward step of the clock does not hold the alarm for longer.
+        for second in -1_000_000..-998_000 {
+            let check = if second < -999_999 { LimitCheck::Beyond } else { LimitCheck::Healthy };
+            observe(&mut machine, &rule, f64::from(second), check);
+        }
+        assert!(!machine.state.is_raised(), "{ends:?}");
     }
 }

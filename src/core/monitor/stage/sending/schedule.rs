@@ -86,6 +86,11 @@ impl Schedule {
         self.quiet_from = time;
     }
 
+    /// The clock was set back by `seconds`.
+    pub(crate) fn step_back(&mut self, seconds: f64) {
+        self.quiet_from = self.quiet_from.plus_secs(-seconds);
+    }
+
     /// Starts the freshness of authenticated frames above all values that an earlier process can have sent, because
     /// receivers accept each value only once. If the stored state was lost, the value follows from the clock.
     pub(crate) fn begin_freshness(&mut self, now: Timestamp) {
