@@ -383,7 +383,11 @@ impl World {
                 assert!(freshness > self.freshness, "freshness {freshness} after {}", self.freshness);
                 self.freshness = freshness;
             }
-            assert!(!(is_asleep && CYCLIC.contains(&id)), "{id:#X} was sent on a sleeping bus, {} steps", self.silent_steps);
+            assert!(
+                !(is_asleep && CYCLIC.contains(&id)),
+                "{id:#X} was sent on a sleeping bus, {} steps",
+                self.silent_steps
+            );
             assert!(!(is_standby && id == 0x79B), "a request was sent in standby");
             let times = if id == ALARM { &mut self.alarms } else { &mut self.requests };
             if id == ALARM || id == 0x79B {
@@ -603,26 +607,46 @@ fn live(seed: u64, steps: u64) -> Counts {
     std::mem::take(&mut world.counts)
 }
 
-/// Runs lives for `PACKWATCH_SIMULATE_S` seconds (default 5), from the seed `PACKWATCH_SEED` (default 1) on.
+impl std::ops::AddAssign for Counts {
+    fn add_assign(&mut self, other: Self) {
+        let Self { steps, faults, starts, commands, frames, commits } = other;
+        self.steps += steps;
+        self.faults += faults;
+        self.starts += starts;
+        self.commands += commands;
+        self.frames += frames;
+        self.commits += commits;
+    }
+}
+
+/// Runs lives for `PACKWATCH_SIMULATE_S` seconds (default 20) on `PACKWATCH_SIMULATE_JOBS` threads (default 1), from the
+/// seed `PACKWATCH_SEED` (default 1) on.
 #[test]
 fn simulated_lives_keep_invariants() {
     let number = |name: &str, default: u64| std::env::var(name).map_or(default, |text| text.parse().expect("a number"));
-    let (first, seconds) = (number("PACKWATCH_SEED", 1), number("PACKWATCH_SIMULATE_S", 5));
+    let (first, seconds) = (number("PACKWATCH_SEED", 1), number("PACKWATCH_SIMULATE_S", 20));
+    let jobs = number("PACKWATCH_SIMULATE_JOBS", 1);
     let began = std::time::Instant::now();
-    let (mut seed, mut total) = (first, Counts::default());
-    while seed == first || began.elapsed().as_secs() < seconds {
-        let Counts { steps, faults, starts, commands, frames, commits } = live(seed, 3000);
-        total = Counts {
-            steps: total.steps + steps,
-            faults: total.faults + faults,
-            starts: total.starts + starts,
-            commands: total.commands + commands,
-            frames: total.frames + frames,
-            commits: total.commits + commits,
-        };
-        seed += 1;
-    }
+    let lives = |job: u64| {
+        let (mut total, mut seed) = (Counts::default(), first + job);
+        loop {
+            total += live(seed, 3000);
+            if began.elapsed().as_secs() >= seconds {
+                return (total, (seed - first - job) / jobs + 1);
+            }
+            seed += jobs;
+        }
+    };
+    let (mut total, mut count) = (Counts::default(), 0);
+    std::thread::scope(|scope| {
+        let running: Vec<_> = (0..jobs).map(|job| scope.spawn(move || lives(job))).collect();
+        for thread in running {
+            let (of_thread, lives) = thread.join().unwrap_or_else(|broken| std::panic::resume_unwind(broken));
+            total += of_thread;
+            count += lives;
+        }
+    });
     let speed = total.steps as f64 * 0.1 / began.elapsed().as_secs_f64();
-    eprintln!("{} lives, {total:?}, {speed:.0} times real time", seed - first);
+    eprintln!("{count} lives, {total:?}, {speed:.0} times real time");
     assert!(total.faults > 0 && total.starts > 1 && total.frames > 0, "{total:?}");
 }
