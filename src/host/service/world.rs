@@ -205,7 +205,7 @@ struct World {
     standby: bool,
     /// Whether the files were changed from outside since the start.
     tampered: bool,
-    /// Steps since the last start or frame.
+    /// Steps since the last start, frame, stop or step of the clock.
     silent_steps: u32,
     silent_until: i64,
     soc: f64,
@@ -320,7 +320,7 @@ impl World {
         let Some(engine) = &mut self.engine else { return };
         let was_asleep = engine.monitor.asleep_since().is_some();
         let ticket = engine.handle(record);
-        // After a start or a frame, the program must first observe the silence itself.
+        // After a start, a frame, a stop or a step of the clock, the program must first observe the silence itself.
         if matches!(record.kind, RecordKind::Frame { .. }) {
             self.silent_steps = 0;
         }
@@ -490,8 +490,14 @@ impl World {
         match self.dice.below(16) {
             0 => self.silent_until = self.now_ns + [3, 30, 300][self.dice.below(3) as usize] * 1_000_000_000,
             1 => self.temperature_c = [10.0, 25.0, 55.0][self.dice.below(3) as usize],
-            2 => self.now_ns += [1, 60, 7200][self.dice.below(3) as usize] * 1_000_000_000,
-            3 => self.now_ns -= [300_000_000, 5_000_000_000][self.dice.below(2) as usize],
+            2 => {
+                self.now_ns += [1, 60, 7200][self.dice.below(3) as usize] * 1_000_000_000;
+                self.silent_steps = 0;
+            }
+            3 => {
+                self.now_ns -= [300_000_000, 5_000_000_000][self.dice.below(2) as usize];
+                self.silent_steps = 0;
+            }
             4 => {
                 let event = [BusEvent::Up, BusEvent::Down, BusEvent::SendFailed { frames: 2 }];
                 let event = event.into_iter().nth(self.dice.below(3) as usize).expect("three");

@@ -200,13 +200,13 @@ fn outlook_pages_are_sent_only_if_wanted() {
 
 #[test]
 fn single_health_value_leaves_others_not_available() {
-    for known in 0..HEALTH_VALUES.len() {
+    for (known, (_, known_name, _, _)) in HEALTH_VALUES.into_iter().enumerate() {
         let fields = health_fields(|n| (n == known).then_some(HEALTH_VALUES[n].2));
         for (n, (page, name, _, wanted)) in HEALTH_VALUES.into_iter().enumerate() {
             let frame = plan().health(page, &fields);
             if n == known {
                 assert_decodes(&format!("Health.{name}"), &frame, wanted);
-            } else if HEALTH_VALUES[known].1 != format!("{name}Std") || n < HEALTH.len() {
+            } else if known_name != format!("{name}Std") || n < HEALTH.len() {
                 assert_not_available(&format!("Health.{name}"), &frame);
             }
         }
