@@ -21,7 +21,6 @@ use packwatch::quantity::{CellIndex, Mode};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 
-/// Frames per message and configuration.
 /// Energy, time and power in the health frame: page, signal, quantity, part, largest value.
 const OUTLOOK: [(usize, &str, Q, Part, f64); 18] = [
     (5, "RemainingEnergy", Q::RemainingEnergy, Part::Mean, 1_048_574.0),
@@ -59,6 +58,7 @@ const HEALTH_PAGES: [&str; 13] = [
     "charge_powers",
 ];
 
+/// Frames per message and configuration.
 const FRAMES: usize = 40;
 
 /// Rules in the order of their numbers. Each row: name, factor from the internal unit to the unit in the frame, and

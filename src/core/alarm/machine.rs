@@ -27,8 +27,9 @@
 //! value does not count. For a learned value, time also counts up to each poll, because the value stays valid. An
 //! unknown value does not reset the count; otherwise, a flickering input could prevent an alarm forever.
 //!
-//! An alarm that changes often stays raised. It may end, or be published as suppressed, [`QUICK_ENDS`] times in short
-//! succession, then once per [`END_PERIOD_S`]. A flickering input therefore fills neither the bus nor the history.
+//! The end of an alarm and the change to `suppressed` are limited: [`QUICK_ENDS`] in short succession, then one per
+//! [`END_PERIOD_S`]. Until one is allowed, the alarm stays raised and no change is published; cyclic frames still show
+//! an unknown value as `suppressed`. A flickering input therefore fills neither the bus nor the history.
 
 use serde::{Deserialize, Serialize};
 use strum::IntoStaticStr;
@@ -36,9 +37,9 @@ use strum::IntoStaticStr;
 use super::limit::{LimitCheck, Observation, RuleConfig};
 use crate::quantity::Timestamp;
 
-/// Number of ends in short succession. An input that returns after a repair needs fewer.
-const QUICK_ENDS: i64 = 10;
-/// Time between further ends, s. With it, an alarm changes at most 288 times a day.
+/// Number of ends in short succession. A person at work on the vehicle causes fewer.
+const QUICK_ENDS: i64 = 60;
+/// Time between further ends, s. An alarm then changes at most 288 times a day.
 const END_PERIOD_S: f64 = 600.0;
 
 /// State of an alarm.

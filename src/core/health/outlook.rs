@@ -54,9 +54,9 @@ pub struct OutlookConfig {
     pub max_discharge_a: Option<f64>,
     /// Largest current of a charge (A); `None` = only the voltages limit it.
     pub max_charge_a: Option<f64>,
-    /// Lowest temperature of the pack (degrees C); `None` = unknown. It limits only what counts as use within limits.
+    /// Lowest temperature (degrees C); `None` = no limit. Only the record of use applies it.
     pub min_temperature_c: Option<f64>,
-    /// Highest temperature of the pack (degrees C); `None` = unknown. It limits only what counts as use within limits.
+    /// Highest temperature (degrees C); `None` = no limit. Only the record of use applies it.
     pub max_temperature_c: Option<f64>,
     /// A charge is complete when its current has fallen to this value (A).
     pub taper_current_a: f64,

@@ -18,7 +18,7 @@ use crate::sample::SensorRange;
 
 /// Longest time between two ticks that counts as observed (s). A running program sends ticks more often.
 const LONGEST_S: f64 = 5.0;
-/// An event is at least this time beyond a limit (s). Single faulty readings are shorter.
+/// An event is at least this time beyond a limit (s), in addition to the longest time that a single reading lasts.
 const EVENT_S: f64 = 1.0;
 /// An event ends after this time within the limit (s), so that a value at the limit is one event, not many.
 const WITHIN_S: f64 = 10.0;
@@ -56,9 +56,9 @@ pub struct RangeUse {
     pub above: LimitUse,
     /// Time in which the value of at least one sensor was unknown or doubtful (s).
     pub unknown_s: f64,
-    /// Lowest value seen; `None` = no value yet.
+    /// Lowest value seen, also in a single reading; `None` = no value yet.
     pub lowest: Option<f64>,
-    /// Highest value seen; `None` = no value yet.
+    /// Highest value seen, also in a single reading; `None` = no value yet.
     pub highest: Option<f64>,
 }
 
@@ -98,7 +98,7 @@ pub struct RestUse {
     pub above_80_s: f64,
     /// Part of the known time with a SOC above 90 % (s).
     pub above_90_s: f64,
-    /// Time without a load in which the current was unknown, or the SOC unknown or not trusted (s).
+    /// Time with an unknown current, and time at rest with a SOC that was unknown or not trusted (s).
     pub unknown_s: f64,
 }
 
@@ -152,10 +152,20 @@ pub struct UseLimits {
     pub voltage_v: [Option<f64>; 2],
     /// Current per cell (A), positive = discharge.
     pub current_a: [Option<f64>; 2],
+    /// Longest time that a single temperature, voltage and current counts (s).
+    pub max_age_s: [f64; 3],
     /// Largest current of a resting cell (A).
     pub rest_a: f64,
     /// Rated capacity of a cell (Ah).
     pub rated_ah: f64,
+}
+
+/// A step of time: its length, and the length of an event (s).
+#[derive(Debug, Clone, Copy)]
+struct Step {
+    step_s: f64,
+    event_s: f64,
+    is_charging: bool,
 }
 
 /// Values of the pack at one time; `None` = unknown or doubtful.
@@ -188,19 +198,18 @@ impl UseCounter {
         if !(0.0..=LONGEST_S).contains(&step_s) {
             return;
         }
-        let (record, is_charging) = (&mut self.record, sample.is_charging);
-        record.temperature_c.observe(
+        let record = &mut self.record;
+        let [temperature_s, voltage_s, current_s] = limits.max_age_s.map(|max_age_s| Step {
             step_s,
-            sample.temperature_c,
-            limits.temperature_c,
-            is_charging,
-            &mut self.temperature,
-        );
+            event_s: EVENT_S + max_age_s,
+            is_charging: sample.is_charging,
+        });
+        record.temperature_c.observe(temperature_s, sample.temperature_c, limits.temperature_c, &mut self.temperature);
         let [low_v, high_v] = limits.voltage_v;
         let voltage_v = [low_v.map(|low_v| low_v - VOLTAGE_MARGIN_V), high_v.map(|high_v| high_v + VOLTAGE_MARGIN_V)];
-        record.voltage_v.observe(step_s, sample.voltage_v, voltage_v, is_charging, &mut self.voltage);
+        record.voltage_v.observe(voltage_s, sample.voltage_v, voltage_v, &mut self.voltage);
         let current = sample.current_a.map(SensorRange::of);
-        record.current_a.observe(step_s, current, limits.current_a, is_charging, &mut self.current);
+        record.current_a.observe(current_s, current, limits.current_a, &mut self.current);
         if let Some(current_a) = sample.current_a {
             record.c_rate.observe(step_s, current_a, limits);
         }
@@ -290,13 +299,12 @@ impl UseRecord {
 impl RangeUse {
     fn observe(
         &mut self,
-        step_s: f64,
+        step: Step,
         range: Option<SensorRange>,
         [low, high]: [Option<f64>; 2],
-        is_charging: bool,
         [below, above]: &mut [Excursion; 2],
     ) {
-        self.unknown_s += if range.is_some_and(|range| range.is_whole) { 0.0 } else { step_s };
+        self.unknown_s += if range.is_some_and(|range| range.is_whole) { 0.0 } else { step.step_s };
         let Some(SensorRange { lowest, highest, is_whole }) = range else { return };
         self.lowest = Some(self.lowest.map_or(lowest, |before| before.min(lowest)));
         self.highest = Some(self.highest.map_or(highest, |before| before.max(highest)));
@@ -306,14 +314,15 @@ impl RangeUse {
         ] {
             // If a sensor is unknown, the known values cannot show that all are within the limit.
             if let Some(is_beyond) = is_beyond.filter(|is_beyond| *is_beyond || is_whole) {
-                limit.add(step_s, is_beyond, is_charging, excursion);
+                limit.add(step, is_beyond, excursion);
             }
         }
     }
 }
 
 impl LimitUse {
-    fn add(&mut self, step_s: f64, is_beyond: bool, is_charging: bool, excursion: &mut Excursion) {
+    fn add(&mut self, step: Step, is_beyond: bool, excursion: &mut Excursion) {
+        let Step { step_s, event_s, is_charging } = step;
         self.known_s += step_s;
         if !is_beyond {
             excursion.within_s += step_s;
@@ -326,7 +335,7 @@ impl LimitUse {
         self.beyond_charging_s += if is_charging { step_s } else { 0.0 };
         let before_s = excursion.beyond_s;
         *excursion = Excursion { beyond_s: before_s + step_s, within_s: 0.0 };
-        if before_s < EVENT_S && excursion.beyond_s >= EVENT_S {
+        if before_s < event_s && excursion.beyond_s >= event_s {
             self.events = self.events.saturating_add(1);
         }
     }

@@ -316,7 +316,7 @@ impl Monitor {
 /// Sets the counts of use. A count is unknown until it could have been above 0.
 fn set_use(values: &mut PackValues, record: &UseRecord) {
     let UseRecord { temperature_c, voltage_v, current_a, half_cycles, rest, .. } = record;
-    let is_judged = [temperature_c, voltage_v, current_a].iter().any(|it| it.below.known_s + it.above.known_s > 0.0);
+    let is_judged = [temperature_c, voltage_v, current_a].iter().all(|it| it.below.known_s + it.above.known_s > 0.0);
     let number = |count: u64, is_known: bool| is_known.then_some(count as f64);
     values.set(Quantity::LimitEvents, number(record.events(), is_judged));
     values.set(Quantity::FastCharges, number(half_cycles.fast_charges, half_cycles.charges > 0));

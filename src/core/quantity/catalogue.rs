@@ -97,7 +97,7 @@ impl Unit {
             Self::Seconds => "s",
             Self::Days => "days",
             Self::Cycles => "cycles",
-            Self::Count => "",
+            Self::Count => "count",
         }
     }
 }

@@ -403,15 +403,21 @@ impl Sampler {
         SensorRange::among(sensors.iter().map(|signal| signal.fresh(now, &self.config.temperature)))
     }
 
+    /// Longest time that a temperature, a voltage and a current is fresh (s).
+    pub fn max_ages_s(&self) -> [f64; 3] {
+        let config = &self.config;
+        [&config.temperature, &config.voltage, &config.current].map(|limits| limits.max_age_s)
+    }
+
     /// The fresh voltages of the cells (V), without the cells of which the voltage is `faulty`; `None` = no fresh
     /// voltage. If only the pack's total is measured, this is the mean voltage of its cells.
     pub fn voltage_range_v(&self, now: Timestamp, faulty: &[CellIndex]) -> Option<SensorRange> {
         let first = 1 + self.sensors;
         let is_faulty = |index: usize| faulty.iter().any(|cell| cell.index() == index);
         let signals = self.state.signals[first..first + self.voltages].iter().enumerate();
-        SensorRange::among(signals.map(|(index, signal)| {
-            signal.fresh(now, &self.config.voltage).filter(|_| faulty.is_empty() || !is_faulty(index))
-        }))
+        SensorRange::among(
+            signals.map(|(index, signal)| signal.fresh(now, &self.config.voltage).filter(|_| !is_faulty(index))),
+        )
     }
 
     /// The last good value of a channel, if it is fresh.

@@ -123,7 +123,9 @@ impl<K: Client> ConnectionSlots<K> {
             return self.close_idlest(now, |place| place.client.user() == user);
         }
         let free_to = if user == Some(0) { total } else { total - for_root };
-        self.taken.len() < free_to || self.close_idlest(now, |_| true)
+        // A user cannot take the slots of root.
+        let is_root = |of: Option<u32>| of == Some(0);
+        self.taken.len() < free_to || self.close_idlest(now, |place| is_root(user) || !is_root(place.client.user()))
     }
 
     /// Registers a connection after [`make_room`](Self::make_room).
@@ -214,6 +216,12 @@ mod tests {
         assert_eq!(try_each(1000, 0..20), 5, "one user, one connection per process");
         assert_eq!(try_each(1001, 20..40), 2, "another user, up to the slot for root");
         assert_eq!(try_each(0, 40..60), 1);
+        let of_root = places.taken.last().expect("root's").task.clone();
+        for _ in 0..8 {
+            places.make_room(&of(1002, 99), now + 2 * GRACE);
+        }
+        tokio::task::yield_now().await;
+        assert!(!of_root.is_finished(), "a user does not replace root");
         drop(open.split_off(5));
         let mut places = ConnectionSlots::new(limits);
         let of_root: Vec<_> = (0..9).filter_map(|_| connect(&mut places, of(0, 1), now)).collect();

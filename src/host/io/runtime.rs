@@ -1,4 +1,4 @@
-//! Creates the asynchronous runtime of every program and thread.
+//! Creates asynchronous runtimes.
 
 use std::io;
 use std::os::unix::net::UnixStream;

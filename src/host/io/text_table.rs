@@ -6,7 +6,8 @@ pub fn printable(text: &str) -> String {
     let mut safe = String::with_capacity(text.len());
     for c in text.chars() {
         if c.is_control() && !matches!(c, '\n' | '\t') {
-            safe.extend(c.escape_default());
+            // As in JSON and TOML.
+            safe.extend(format!("\\u{:04x}", u32::from(c)).chars());
         } else {
             safe.push(c);
         }
@@ -19,7 +20,9 @@ pub fn text_table<H: AsRef<str>>(heads: &[H], rows: impl IntoIterator<Item = Vec
     let heads: Vec<String> = heads.iter().map(|head| head.as_ref().to_owned()).collect();
     let rows: Vec<Vec<String>> = Some(heads).filter(|heads| !heads.is_empty()).into_iter().chain(rows).collect();
     let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
-    let entry = |row: &[String], column: usize| row.get(column).map_or_else(String::new, |text| printable(text));
+    let entry = |row: &[String], column: usize| {
+        row.get(column).map_or_else(String::new, |text| printable(text).replace(['\n', '\t'], " "))
+    };
     let widths: Vec<usize> =
         (0..columns).map(|c| rows.iter().map(|row| entry(row, c).chars().count()).max().unwrap_or(0)).collect();
     let line = |row: &Vec<String>| {

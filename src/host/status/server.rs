@@ -18,7 +18,7 @@ use tokio::time::{Instant, timeout};
 use super::counters::ClientCounts;
 use super::document::StatusDocument;
 use super::{MAX_SILENCE, MODE, SLOTS, STALE, daemon_path, stream_path};
-use crate::io::connection_slots::{Activity, ConnectionSlots, LocalProcess};
+use crate::io::connection_slots::{Activity, ConnectionSlots, LocalProcess, SlotLimits};
 use crate::io::place::PlaceSetting;
 use crate::io::runtime::new_runtime;
 use crate::io::unix_socket::{BindError, BoundSocket, bind};
@@ -206,7 +206,14 @@ impl RefusalLog {
     fn note(&mut self) {
         self.unreported += 1;
         if self.reported.is_none_or(|reported| reported.elapsed() >= REFUSAL_LOG_PERIOD) {
-            tracing::warn!(clients = self.unreported, limit = SLOTS.total, "status clients rejected: too many at once");
+            let SlotLimits { total, per_user, per_client, .. } = SLOTS;
+            tracing::warn!(
+                clients = self.unreported,
+                per_client,
+                per_user,
+                total,
+                "status clients rejected: too many at once"
+            );
             (self.unreported, self.reported) = (0, Some(Instant::now()));
         }
     }

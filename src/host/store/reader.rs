@@ -159,7 +159,7 @@ impl HistoryReader {
     pub fn damage(&self) -> Option<String> {
         let damaged = self.damaged.borrow();
         let first = damaged.first()?;
-        Some(format!("{} damaged rows of the history were left out, the first is row {first}", damaged.len()))
+        Some(format!("damaged rows left out of the history: {}, the first is row {first}", damaged.len()))
     }
 
     /// Runs all queries of `read` on one snapshot of the file, even while a daemon writes.

@@ -66,12 +66,13 @@ impl Reserve {
             return;
         }
         let path = self.folder.join(FILE_NAME);
-        let opened = open(&path).or_else(|_| {
-            // Something else has the name, or nothing.
+        if fs::symlink_metadata(&path).is_ok_and(|found| !found.is_file()) {
+            // Something else has the name.
             let _ = fs::remove_file(&path);
-            self.left = 0;
-            File::create_new(&path)
-        });
+        }
+        let is_missing = !path.exists();
+        let opened = if is_missing { File::create_new(&path) } else { open(&path) };
+        self.left = if is_missing { 0 } else { self.left };
         let grown = opened.and_then(|file| {
             let grown = write(&file, BYTES - self.left);
             // A partly extended file would only take room from other files.

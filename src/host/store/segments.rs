@@ -235,7 +235,9 @@ fn pairs(connection: &Connection) -> rusqlite::Result<Vec<(Segment, Segment)>> {
     let mut statement = connection.prepare(&format!("SELECT {COLUMNS} FROM segment ORDER BY id"))?;
     for segment in statement.query_map([], Segment::of_row)? {
         // A segment with a value of a wrong type breaks the chain.
-        let segment = segment.or_else(|error| if is_damage(&error) { Ok(Segment::START) } else { Err(error) })?;
+        let next = before.last.saturating_add(1);
+        let damaged = Segment { id: before.id.saturating_add(1), first: next, last: next, ..Segment::START };
+        let segment = segment.or_else(|error| if is_damage(&error) { Ok(damaged) } else { Err(error) })?;
         pairs.push((before, segment));
         before = segment;
     }

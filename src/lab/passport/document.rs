@@ -32,10 +32,10 @@ pub fn passport(standard: Standard, condition: &Condition, manufacturer: Value) 
         if known[..index].iter().any(|(_, before, _)| before.group == place.group) {
             continue;
         }
-        // The temperatures share a group, which has the time of the latest value.
+        // The temperatures share a group, which has the time of the oldest value.
         let of_group = known.iter().filter(|(_, other, _)| other.group == place.group);
-        let latest = of_group.map(|(.., quantity)| quantity.time).max().unwrap_or(quantity.time);
-        faults.extend(insert(&mut root, place.group, place.time, Value::from(format_utc(latest))).err());
+        let oldest = of_group.map(|(.., quantity)| quantity.time).min().unwrap_or(quantity.time);
+        faults.extend(insert(&mut root, place.group, place.time, Value::from(format_utc(oldest))).err());
     }
     if standard == Standard::ProductCondition {
         add_events(&mut root, condition);

@@ -36,7 +36,7 @@ pub(super) fn limits(record: &UseRecord) -> impl Iterator<Item = Vec<String>> {
 pub(super) fn rows(record: &UseRecord) -> Vec<(String, String)> {
     let UseRecord { c_rate, half_cycles, rest, .. } = record;
     let times = |seconds: &[f64; 5]| {
-        let names = ["0.5 C", "1 C", "2 C", "3 C", "above 3 C"].into_iter();
+        let names = ["0 to 0.5 C", "0.5 to 1 C", "1 to 2 C", "2 to 3 C", "above 3 C"].into_iter();
         let times = names.zip(seconds).map(|(name, seconds)| format!("{name}: {}", format::length(*seconds)));
         times.collect::<Vec<_>>().join(", ")
     };
@@ -47,8 +47,8 @@ pub(super) fn rows(record: &UseRecord) -> Vec<(String, String)> {
     });
     let depths = depths.collect::<Vec<_>>().join(", ");
     let rows = [
-        ("Charging up to", times(&c_rate.charge_s)),
-        ("Discharging up to", times(&c_rate.discharge_s)),
+        ("Charging by C-rate", times(&c_rate.charge_s)),
+        ("Discharging by C-rate", times(&c_rate.discharge_s)),
         ("Discharges by depth", if depths.is_empty() { "none".to_owned() } else { depths }),
         ("Charges, of these above 1 C", format!("{}, {}", half_cycles.charges, half_cycles.fast_charges)),
         ("Charges and discharges with a doubtful current", half_cycles.unknown.to_string()),

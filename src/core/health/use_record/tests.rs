@@ -4,6 +4,7 @@ const LIMITS: UseLimits = UseLimits {
     temperature_c: [Some(0.0), Some(45.0)],
     voltage_v: [Some(3.0), Some(4.2)],
     current_a: [Some(-4.0), None],
+    max_age_s: [0.0; 3],
     rest_a: 0.1,
     rated_ah: 2.0,
 };
@@ -187,4 +188,22 @@ fn stored_counter_round_trips_and_damage_is_found() {
     assert_eq!(bench.counter.check(), Ok(()));
     stored["record"]["c_rate"]["charge_s"][2] = (-1.0).into();
     assert!(serde_json::from_value::<UseCounter>(stored).unwrap().check().is_err());
+}
+
+#[test]
+fn single_reading_is_no_event() {
+    let limits = UseLimits { max_age_s: [5.0; 3], ..LIMITS };
+    let hot = UseSample { temperature_c: range(90.0, 90.0, true), ..REST };
+    let mut counter = UseCounter::default();
+    let mut observe = |tenths: std::ops::Range<u32>, sample: &UseSample| {
+        for tenth in tenths {
+            counter.observe(Timestamp::from_secs(f64::from(tenth) / 10.0), &limits, sample);
+        }
+        counter.record().temperature_c.above
+    };
+    observe(0..10, &REST);
+    // A reading that comes every 5 s is valid for 5 s.
+    let LimitUse { beyond_s, events, .. } = observe(10..60, &hot);
+    assert!((beyond_s - 5.0).abs() < 0.2 && events == 0, "{beyond_s} s, {events} events");
+    assert_eq!(observe(60..110, &hot).events, 1, "two readings");
 }

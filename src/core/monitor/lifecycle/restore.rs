@@ -103,6 +103,9 @@ impl Monitor {
         snapshot.rebase(taken.unwrap_or(now).nanos().saturating_sub(snapshot.time.nanos()));
         let (buses, taken_at) = (std::mem::take(&mut snapshot.intake.buses), snapshot.time);
         snapshot.intake.buses = buses.restored(taken_at, now);
+        if taken.is_none() {
+            snapshot.sending.schedule.alarms.use_up(now);
+        }
         self.continue_from(snapshot.for_restart(), now, out);
         if taken.is_some() { Beginning::Restored } else { Beginning::RestoredAgeless }
     }
@@ -242,7 +245,7 @@ impl Stages {
         self.publisher(now, out).publish_alarms();
     }
 
-    /// Restores the alarms stored at `stored`; `None` = the run goes on without a break. Alarms without a configured threshold end, and receivers on the bus are notified.
+    /// Restores the alarms stored at `stored`; `None` = the same run continues. Alarms without a configured threshold end, and receivers on the bus are notified.
     fn restore_alarms(&mut self, time: Timestamp, state: &AlarmSnapshot, stored: Option<Timestamp>, out: &mut Outputs) {
         self.alarming.state.knows_all_valid = false;
         let orphans = self.alarming.engine.restore(time, state);

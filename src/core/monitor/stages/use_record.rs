@@ -26,6 +26,7 @@ impl Stages {
             temperature_c: [min_temperature_c, max_temperature_c],
             voltage_v: [min_voltage_v.or_else(lowest_v), max_voltage_v.or_else(highest_v)],
             current_a: [max_charge_a.map(|charge_a| -charge_a), max_discharge_a],
+            max_age_s: self.sampling.sampler.max_ages_s(),
             rest_a: self.learning.config.transition.dead_band_a / self.sampling.sampler.strings(),
             rated_ah: self.estimation.bank.own_model().rated_capacity_ah,
         }

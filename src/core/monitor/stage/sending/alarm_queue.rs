@@ -238,6 +238,11 @@ impl AlarmQueue {
         self.changed.iter_mut().for_each(|changed| changed.due = changed.due.min(now.plus_nanos(REPETITION_NS)));
     }
 
+    /// Uses up the budget, because frames of an earlier process may have used it at any time up to `now`.
+    pub(crate) fn use_up(&mut self, now: Timestamp) {
+        self.free = now.plus_nanos(DELAY_NS);
+    }
+
     /// Shifts stored times to another clock.
     pub(crate) fn rebase(&mut self, by_nanos: i64) {
         self.free = self.free.plus_nanos(by_nanos);
