@@ -38,7 +38,7 @@ use super::limit::{LimitCheck, Observation, RuleConfig};
 use crate::quantity::Timestamp;
 
 /// Number of ends in short succession. A person at work on the vehicle causes fewer.
-const QUICK_ENDS: i64 = 60;
+const QUICK_ENDS: i64 = 120;
 /// Time between further ends, s. An alarm then changes at most 288 times a day.
 const END_PERIOD_S: f64 = 600.0;
 

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use tempfile::TempDir;
 use tokio::io::AsyncRead;
 
+use super::super::MAX_CONNECTIONS;
 use super::super::protocol::{CommandOutcome, contents};
 use super::*;
 use crate::monitor::Command;
