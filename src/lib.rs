@@ -28,7 +28,7 @@
 //! | | [`status`] | status document, metrics |
 //! | | [`service`] | the live loop: links, ticks, readiness, reload, watchdog |
 //! | | `http` | HTTP server of the exporter and of the uplink |
-//! | | [`exporter`] | metrics for Prometheus |
+//! | | [`exporter`] | live page, metrics for Prometheus |
 //! | | [`replay`] | the loop over recorded logs |
 //! | | [`wiring_check`] | the two loops of `packwatch doctor`: over logs and over live input |
 //! | | `failure` | text and exit code of a failed command, for every program |
@@ -76,6 +76,7 @@
 //! | the signature of a cell fault | `core/cell_faults/difference.rs`, `core/cell_faults/channels.rs` |
 //! | when a cell fault is reported | `core/cell_faults/fault.rs` |
 //! | capacity learned from a half-cycle | `core/health/learner.rs` |
+//! | how a pack is used: limits, C-rates, fast charges | `core/health/use_record.rs` (counters), `core/monitor/stages/use_record.rs` (values, limits) |
 //! | learned values of packs that were exchanged | `core/monitor/stages/pack_memory.rs` |
 //! | contents of the stored state | the state of the stage, `core/monitor/snapshot.rs`, `core/monitor/lifecycle/restore.rs` (restore) |
 //! | a configuration key | `host/config/schema/keys/` (files `pack`, `input`, `limits`, `algorithms`, `traffic`), `host/config/mod.rs` (list of the steps) |

@@ -14,7 +14,7 @@ use packwatch_host::failure::Failure;
 use self::output::{Format, Output};
 use super::common::logs::{InputArgs, log_options};
 use super::common::numbers::{NamedValue, one_of};
-use super::common::output::{failure, named, unless_closed};
+use super::common::output::{failure, named, note, unless_closed};
 use super::common::progress::Bar;
 use crate::config::{self, Config};
 use crate::io::csv_log::CsvOptions;
@@ -86,7 +86,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         output = estimates::write(args, config, output)?;
     }
     unless_closed(output.finish())?;
-    eprintln!("{}", summary.text(&args.out));
+    note(summary.text(&args.out));
     Ok(())
 }
 
@@ -147,12 +147,12 @@ fn write_frames(args: &Args, config: Option<&Config>, output: &mut Output) -> Re
     }
     bar.clear();
     let counts = source.counts();
-    counts.inputs.iter().for_each(|input| eprintln!("{input}"));
+    counts.inputs.iter().for_each(note);
     if let Some(first) = &counts.first_bad_line {
-        eprintln!("{} of {} lines cannot be read, first {first}", counts.bad_lines, counts.lines);
+        note(format_args!("{} of {} lines cannot be read, first {first}", counts.bad_lines, counts.lines));
     }
     if source.has_moved_stamps() {
-        eprintln!("a log begins before the end of the log before it, so its stamps were moved to follow that log");
+        note("a log begins before the end of the log before it, so its stamps were moved to follow that log");
     }
     summary.interfaces = source.interfaces().join(", ");
     let good = summary.frames + summary.error_frames;

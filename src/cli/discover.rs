@@ -11,7 +11,7 @@ use serde_json::json;
 
 use super::common::files::{database, named_from, read};
 use super::common::numbers::integer;
-use super::common::output::{failure, print, print_json, table, unless_closed};
+use super::common::output::{failure, note, print, print_json, table, unless_closed};
 use super::common::progress::Bar;
 use crate::config::{self, ConfigFaults};
 use crate::io::csv_log::CsvOptions;
@@ -111,10 +111,10 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     };
     let pack = search.configuration(&args.log, &args.known, file)?.map_err(failed)?;
     if let Some(own) = save(&pack, file, inputs(std::slice::from_ref(&args.log), &args.known))? {
-        eprintln!("{} written: fields that no DBC describes", own.display());
+        note(format_args!("{} written: fields that no DBC describes", own.display()));
     }
-    eprintln!("{} written; please check what the log does not show:", file.display());
-    pack.open.iter().for_each(|question| eprintln!("  {question}"));
+    note(format_args!("{} written; please check what the log does not show:", file.display()));
+    pack.open.iter().for_each(|question| note(format_args!("  {question}")));
     Ok(())
 }
 
@@ -236,7 +236,7 @@ fn feed(
     bar.clear();
     let counts = source.counts();
     if let Some(first) = &counts.first_bad_line {
-        eprintln!("{} of {} lines cannot be read, first {first}", counts.bad_lines, counts.lines);
+        note(format_args!("{} of {} lines cannot be read, first {first}", counts.bad_lines, counts.lines));
     }
     Ok((counts.clone(), source.interfaces().to_vec()))
 }

@@ -62,7 +62,7 @@ struct PlanArgs {
 
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "Writes DIR/VEHICLE/half_cycles.parquet, alarms.parquet, with --estimates estimates.parquet, and last vehicle.json. Vehicles that have \
+    after_help = "Writes DIR/VEHICLE/half_cycles.parquet, alarms.parquet, use_record.parquet, with --estimates estimates.parquet, and last vehicle.json. Vehicles that have \
     vehicle.json are not replayed again, so a stopped run can be continued. If a vehicle fails, the run reports it and continues; the next run tries \
     it again. The exit code is 0 if every vehicle was replayed, 1 if a vehicle failed."
 )]
@@ -94,7 +94,7 @@ struct RunArgs {
 
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "Writes vehicles.parquet, half_cycles.parquet, alarms.parquet and, if exported, estimates.parquet. Each vehicle has its own row group, \
+    after_help = "Writes vehicles.parquet, half_cycles.parquet, alarms.parquet, use_record.parquet and, if exported, estimates.parquet. Each vehicle has its own row group, \
     sorted by name. The bytes do not depend on the shards or their order."
 )]
 struct MergeArgs {

@@ -126,9 +126,13 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let folder = args.state.clone().unwrap_or_else(store::standard_folder);
     let reader = HistoryReader::open(&folder).map_err(Failure::new)?;
     match &args.what {
-        None => list(&reader, args),
-        Some(HistoryCommand::Export(export)) => self::export(&reader, export),
-        Some(HistoryCommand::Verify(verify)) => self::verify(&reader, verify),
+        None => list(&reader, args)?,
+        Some(HistoryCommand::Export(export)) => self::export(&reader, export)?,
+        Some(HistoryCommand::Verify(verify)) => self::verify(&reader, verify)?,
+    }
+    match reader.damage() {
+        None => Ok(()),
+        Some(damage) => Err(Failure::new(format!("{damage}; \"packwatch history verify\" checks all rows"))),
     }
 }
 

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 use super::common::files::{database, named_from, read};
 use super::common::numbers::integer;
-use super::common::output::{failure, unless_closed};
+use super::common::output::{failure, note, unless_closed};
 use crate::io::result_file::{check_place, write_file};
 use crate::lab::import::ImportResult;
 use crate::lab::import::bpx::{self, BpxSettings};
@@ -132,19 +132,19 @@ fn import_bpx(args: &BpxArgs) -> Result<(), Failure> {
     let source = args.file.display().to_string();
     let settings = BpxSettings { source: source.clone(), name: args.name.clone() };
     let result = bpx::import(&text, &settings).map_err(failure)?;
-    for note in &result.notes {
-        eprintln!("{source}: note: {note}");
+    for found in &result.notes {
+        note(format_args!("{source}: note: {found}"));
     }
-    eprintln!("{source}: {:.3} Ah between the cut-offs, {} Ah nominal", result.capacity_ah, result.nominal_ah);
+    note(format_args!("{source}: {:.3} Ah between the cut-offs, {} Ah nominal", result.capacity_ah, result.nominal_ah));
     unless_closed(write_file(&args.write, result.text.as_bytes()))
 }
 
 fn report(source: &str, result: &ImportResult) {
     for warning in &result.warnings {
-        eprintln!("{source}: {warning}");
+        note(format_args!("{source}: {warning}"));
     }
-    eprintln!("{source}: {} signals converted, {} left out", result.signals, result.exclusions.len());
+    note(format_args!("{source}: {} signals converted, {} left out", result.signals, result.exclusions.len()));
     for (reason, count) in result.counts() {
-        eprintln!("  {count} {reason}");
+        note(format_args!("  {count} {reason}"));
     }
 }

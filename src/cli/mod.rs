@@ -230,7 +230,7 @@ pub fn main() -> ExitCode {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {
             if !failure.message.is_empty() {
-                eprintln!("{}", failure.message);
+                common::output::note(failure.message);
             }
             ExitCode::from(failure.code)
         }

@@ -65,8 +65,8 @@ pub(crate) struct Args {
     /// accidents
     #[arg(long = "static", value_name = "FILE.json")]
     manufacturer: Option<PathBuf>,
-    /// Write an empty manufacturer's part in the form of the standard: fill in what is known, leave null where nothing is,
-    /// and give the file back with --static
+    /// Write an empty manufacturer's part: fill in the known values, leave the others null, and pass the file with
+    /// --static
     #[arg(long, conflicts_with_all = ["config", "logs", "state", "manufacturer", "details"])]
     static_template: bool,
     /// Usable energy of the pack at certification (kWh); needed for the state of certified energy (SOCE)

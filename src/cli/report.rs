@@ -80,6 +80,7 @@ pub(crate) fn write(args: &Args) -> Result<Verdict, Failure> {
         config_text: config_text?,
         diagnosis: snapshot.as_ref().and_then(Snapshot::diagnosis),
         imbalance: snapshot.as_ref().and_then(Snapshot::imbalance),
+        use_record: snapshot.as_ref().map(|snapshot| *snapshot.use_record()),
         reference: reference.unwrap_or_default(),
         provenance,
     };
@@ -99,7 +100,8 @@ pub(crate) fn page_of_store(folder: &Path) -> Result<String, String> {
     let model = cell_model(snapshot.as_ref(), None).map_err(text)?;
     let diagnosis = snapshot.as_ref().and_then(Snapshot::diagnosis);
     let imbalance = snapshot.as_ref().and_then(Snapshot::imbalance);
-    let context = PageContext { title, model, diagnosis, imbalance, provenance, ..PageContext::default() };
+    let use_record = snapshot.as_ref().map(|snapshot| *snapshot.use_record());
+    let context = PageContext { title, model, diagnosis, imbalance, use_record, provenance, ..PageContext::default() };
     Ok(report::page(&data, &context))
 }
 

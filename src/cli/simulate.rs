@@ -11,6 +11,7 @@ mod settings;
 use std::path::PathBuf;
 
 use super::common::numbers::{integer, one_of};
+use super::common::output::note;
 use crate::can::encode::{InputEncoder, InputProtector};
 use crate::can::{CanId, Frame};
 use crate::config::{self, Config};
@@ -106,7 +107,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     }
     sink.finish()?;
     truth.map_or(Ok(()), TruthWriter::finish)?;
-    eprintln!("{}", summary(&sim, &totals));
+    note(summary(&sim, &totals));
     Ok(())
 }
 

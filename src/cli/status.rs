@@ -117,7 +117,7 @@ fn mean<const IS_PACK: bool>(values: &Values<IS_PACK>, quantity: Quantity, decim
 const fn screen_unit(unit: Unit) -> (&'static str, f64) {
     match unit {
         Unit::Level | Unit::Fraction => (" %", 100.0),
-        Unit::Ratio => ("", 1.0),
+        Unit::Ratio | Unit::Count => ("", 1.0),
         Unit::Volts => (" V", 1.0),
         Unit::Amperes => (" A", 1.0),
         Unit::Celsius => (" °C", 1.0),

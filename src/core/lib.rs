@@ -38,6 +38,7 @@
 //! | another end-to-end profile | `can/e2e.rs` |
 //! | authentication of frames | `can/secoc.rs` |
 //! | which commands are executed | `monitor/stage/intake/command_gate.rs` |
+//! | a counter of the record of use | `health/use_record.rs`, `monitor/stages/use_record.rs` (values, limits) |
 //! | what is kept about packs that were exchanged | `monitor/stages/pack_memory.rs` |
 //! | a plausibility check of a signal | `sample/signal.rs` |
 //! | a plausibility check of the current against the voltages | `sample/frozen.rs` |

@@ -13,8 +13,9 @@ use nix::libc::{EISDIR, O_NONBLOCK};
 /// Maximum size of a file, bytes. The DBC of a whole vehicle has 10 MB.
 pub const MAX_BYTES: u64 = 64 << 20;
 
-/// Longest wait for the data of a pipe, and time between two attempts.
+/// Longest wait for data of a pipe.
 const PIPE_LIMIT: Duration = Duration::from_secs(10);
+/// Time between two attempts to read from a pipe.
 const PIPE_RETRY: Duration = Duration::from_millis(10);
 
 /// Opens a regular file.
@@ -41,27 +42,40 @@ fn open_any(path: &Path) -> io::Result<File> {
 /// Reads a regular file or a pipe of at most [`MAX_BYTES`].
 ///
 /// # Errors
-/// Fails if the path is a folder or a device, if it cannot be read, if it is longer, or if a pipe stays without data.
+/// As [`read_up_to`].
 pub fn read(path: &Path) -> io::Result<Vec<u8>> {
+    read_up_to(path, MAX_BYTES)
+}
+
+/// Reads a regular file or a pipe of at most `max_bytes`.
+///
+/// # Errors
+/// Fails if the path is a folder or a device, if it cannot be read, if it is longer, or if a pipe stays without data for
+/// 10 s.
+pub fn read_up_to(path: &Path, max_bytes: u64) -> io::Result<Vec<u8>> {
     let file = open_any(path)?;
     let kind = file.metadata()?.file_type();
     if !kind.is_file() && !kind.is_fifo() {
         return Err(unreadable(kind));
     }
-    let (mut bytes, mut part) = (Vec::new(), file.take(MAX_BYTES + 1));
-    let mut waited = Duration::ZERO;
-    while let Err(error) = part.read_to_end(&mut bytes) {
-        if error.kind() != io::ErrorKind::WouldBlock || waited > PIPE_LIMIT {
+    let (mut bytes, mut rest) = (Vec::new(), file.take(max_bytes + 1));
+    let (mut waited, mut before) = (Duration::ZERO, 0);
+    while let Err(error) = rest.read_to_end(&mut bytes) {
+        if error.kind() != io::ErrorKind::WouldBlock {
             return Err(error);
         }
+        waited = if bytes.len() > before { Duration::ZERO } else { waited + PIPE_RETRY };
+        if waited > PIPE_LIMIT {
+            return Err(io::Error::other(format!("no data from the pipe for {} s", PIPE_LIMIT.as_secs())));
+        }
+        before = bytes.len();
         std::thread::sleep(PIPE_RETRY);
-        waited += PIPE_RETRY;
     }
-    let is_too_long = bytes.len() as u64 > MAX_BYTES;
-    if is_too_long { Err(io::Error::other(format!("must be at most {MAX_BYTES} bytes"))) } else { Ok(bytes) }
+    let is_too_long = bytes.len() as u64 > max_bytes;
+    if is_too_long { Err(io::Error::other(format!("must be at most {max_bytes} bytes"))) } else { Ok(bytes) }
 }
 
-/// Reads a regular text file of at most [`MAX_BYTES`].
+/// Reads a text file or a pipe of at most [`MAX_BYTES`].
 ///
 /// # Errors
 /// As [`read`], and if the file is not UTF-8.
@@ -85,7 +99,7 @@ mod tests {
     }
 
     #[test]
-    fn pipe_is_read_to_its_end_but_never_opened() {
+    fn pipe_is_read_by_read_and_refused_by_open() {
         let folder = tempfile::tempdir().expect("a folder");
         let pipe = folder.path().join("pipe");
         assert!(std::process::Command::new("mkfifo").arg(&pipe).status().expect("started").success());

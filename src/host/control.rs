@@ -26,6 +26,7 @@ pub mod test_alarm;
 use std::path::PathBuf;
 use std::time::Duration;
 
+use crate::io::connection_slots::SlotLimits;
 use crate::io::unix_socket::{client_folder, runtime_folder};
 
 pub use server::{ControlServer, PendingRequest};
@@ -33,8 +34,8 @@ pub use server::{ControlServer, PendingRequest};
 /// Maximum number of connections, enough for a person, a display and a script. Each connection is a task with a few
 /// kilobytes.
 pub const MAX_CONNECTIONS: usize = 8;
-/// Maximum number of connections of one process.
-pub const MAX_PER_PROCESS: usize = 4;
+/// Limits of the connections. One user cannot take all, and root always finds one.
+pub(crate) const SLOTS: SlotLimits = SlotLimits { total: MAX_CONNECTIONS, for_root: 1, per_user: 6, per_client: 4 };
 /// Longest request, bytes, including the end of the line. The longest valid request has less than 200 bytes.
 pub const MAX_REQUEST_BYTES: usize = 4096;
 /// Time that a client has to send a request, and again to read the answer. A script needs milliseconds. Without this

@@ -7,8 +7,8 @@
 //! * `/`: the live page; `/events`: its server-sent events; `/-/healthy`: a liveness check.
 //! * `/report`: the report of the daemon's store, if this program can make reports.
 //! * On the address of a network, the page and the events need a token ([`Access`]).
-//! * The connections are those of [`http`].
-//! * SIGTERM and SIGINT stop the exporter cleanly.
+//! * [`http`] limits connections and request heads.
+//! * the signals of [`Stop`] stop the exporter cleanly.
 
 mod access;
 mod live;
@@ -33,6 +33,7 @@ use self::access::{Access, Decision};
 use self::live::{AnswerBody, Live};
 use super::http::{self, Bytes, Full, Incoming, Request, Response, StatusCode, answer_with, reads, with};
 use super::io::connection_slots::Activity;
+use super::io::runtime::new_runtime;
 use super::io::stop::Stop;
 use super::service::notify;
 use super::status::metrics::{openmetrics, prometheus_text};
@@ -66,8 +67,7 @@ struct Site {
 /// # Errors
 /// Fails if the token cannot be read, or if the address cannot be bound.
 pub fn run(listen: SocketAddr, socket: &Path, token_file: Option<&Path>, report: ReportMaker) -> Result<(), String> {
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
-    let runtime = runtime.map_err(|error| format!("cannot start: {error}"))?;
+    let runtime = new_runtime().map_err(|error| format!("cannot start: {error}"))?;
     let access = Access::new(listen.ip(), token_file)?;
     let site = Site::new(access, report);
     let served = async { serve(TcpListener::bind(listen).await?, Rc::new(site), socket.to_owned()).await };

@@ -47,8 +47,8 @@ const DRAIN_LIMIT: Duration = Duration::from_secs(1);
 /// Pause after a connection could not be accepted.
 const ACCEPT_PAUSE: Duration = Duration::from_secs(1);
 
-/// Serves connections until a signal stops the program. `answer` gets a request, the activity of its connection, and the
-/// end of the connection's life. Must run in a `LocalSet`.
+/// Serves connections until a signal stops the program. `answer` gets a request, the activity of its connection, and
+/// the end of the connection's life. Must run in a `LocalSet`.
 pub async fn serve<A, F, B>(listener: TcpListener, stop: &mut Stop, answer: A)
 where
     A: Fn(Request<Incoming>, Activity, Instant) -> F + Clone + 'static,
@@ -56,7 +56,9 @@ where
     B: Body + 'static,
     B::Error: Into<Box<dyn Error + Send + Sync>>,
 {
-    let mut places = ConnectionSlots::new(SlotLimits { total: MAX_CONNECTIONS, per_client: MAX_PER_ADDRESS });
+    let limits =
+        SlotLimits { total: MAX_CONNECTIONS, for_root: 0, per_user: MAX_CONNECTIONS, per_client: MAX_PER_ADDRESS };
+    let mut places = ConnectionSlots::new(limits);
     let mut connections = JoinSet::new();
     loop {
         let accepted = tokio::select! {
@@ -141,8 +143,9 @@ pub fn reads<B>(request: &Request<B>) -> bool {
     matches!(*request.method(), Method::GET | Method::HEAD)
 }
 
-/// Whether a request names this computer by a numeric address or as `localhost`. Otherwise a foreign page in a browser on
-/// this computer could read the answer under a name that it lets point to this computer (DNS rebinding).
+/// Whether a request names this computer by a numeric address or as `localhost`. Otherwise a foreign page in a browser
+/// on this computer could read the answer under its own host name, if that name resolves to this computer (DNS
+/// rebinding).
 pub fn names_this_computer<B>(request: &Request<B>) -> bool {
     request.headers().get_all(HOST).iter().all(|host| host.to_str().is_ok_and(is_numeric))
 }

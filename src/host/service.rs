@@ -2,7 +2,8 @@
 //!
 //! In: frames and states of the interfaces, ticks, commands. Out: frames, events, status. One task owns the core. Every
 //! input is written to the journal before the core handles it, so that a replay of the journal produces the same
-//! frames. No fault of a bus, a disk or the service manager ends the loop. SIGTERM and SIGINT end the loop cleanly.
+//! frames. No fault of a bus, a disk or the service manager ends the loop. The signals of
+//! [`Stop`] end the loop cleanly.
 
 mod engine;
 mod j1939_carrier;
@@ -11,6 +12,8 @@ mod pending_answers;
 pub mod readiness;
 mod reload;
 mod status_publisher;
+#[cfg(test)]
+mod world;
 
 use std::io;
 use std::path::PathBuf;
@@ -30,6 +33,7 @@ use crate::config::{Config, VehicleIdentity};
 use crate::io::can_key::CanKey;
 use crate::io::clock::{MappedClock, Reading, StepDetector};
 use crate::io::place::PlaceSetting;
+use crate::io::runtime::check_descriptors;
 use crate::io::segments::SegmentLimits;
 use crate::io::socket::{Link, LinkConfig, LinkOutput};
 use crate::io::stop::Stop;
@@ -116,6 +120,7 @@ impl Service {
     /// # Errors
     /// Fails if the service cannot start, or if its final snapshot cannot be written.
     pub fn run(self) -> Result<(), ServiceError> {
+        check_descriptors()?;
         let mut builder = tokio::runtime::Builder::new_current_thread();
         let runtime = builder.enable_all().max_blocking_threads(BLOCKING_THREADS).build()?;
         // The service runs as a spawned task, because waking the future of `block_on` itself costs a system call per

@@ -14,8 +14,8 @@
 //! * Once a second, the service loop copies the values of a document into a draft and offers the draft to a separate
 //!   thread. That thread serialises the draft and serves the clients, so no client affects the loop. A draft offered
 //!   while the thread is busy is dropped and counted.
-//! * At most [`MAX_CLIENTS`] clients are served. Further clients are rejected immediately and counted. A client that
-//!   does not read within [`MAX_SILENCE`] is dropped and counted.
+//! * [`SLOTS`] limits the number of clients. Further clients are rejected immediately and counted. A client that does
+//!   not read within [`MAX_SILENCE`] is dropped and counted.
 //! * A document older than [`STALE`] is not sent. The client waits for a fresh document, and receives nothing if no
 //!   fresh document is published within [`MAX_SILENCE`]. A loop that hangs therefore does not look healthy.
 
@@ -39,11 +39,12 @@ use std::time::Duration;
 
 pub use server::StatusServer;
 
+use crate::io::connection_slots::SlotLimits;
 use crate::io::unix_socket::{client_folder, runtime_folder};
 
-/// Maximum number of clients of both sockets together. A vehicle needs far fewer: a display, an exporter and a few
-/// scripts. Each client uses a descriptor and a few kilobytes.
-pub const MAX_CLIENTS: usize = 64;
+/// Limits of the clients of both sockets together. A vehicle needs far fewer: a display, an exporter and a few scripts.
+/// Each client uses a descriptor and a few kilobytes. One user cannot take all slots, and root always finds one.
+const SLOTS: SlotLimits = SlotLimits { total: 64, for_root: 4, per_user: 40, per_client: 16 };
 /// Longest time that a client may take to read a document, and longest wait of a client for a fresh document.
 pub const MAX_SILENCE: Duration = Duration::from_secs(5);
 /// Time between documents.

@@ -274,16 +274,20 @@ impl Store {
         self.submit(commit, monitor, now)
     }
 
-    /// Writes the state of a start and waits until it is on disk, for a limited time. A power cut right after the start
-    /// then cannot make the next start use the same freshness again.
+    /// Writes the state of a start to both state files and waits until it is on disk, for a limited time. A power cut
+    /// right after the start, or a damaged file, then cannot make the next start use the same freshness again.
     pub fn write_start(&mut self, monitor: &Monitor, now: Timestamp) {
-        let ticket = self.write_checkpoint(monitor, now);
         let limit = Instant::now() + MAX_FINISH;
-        while self.progress.borrow().ticket < ticket && Instant::now() < limit {
-            std::thread::sleep(Duration::from_millis(1));
+        let mut is_stored = true;
+        for _ in state_files::FILES {
+            let ticket = self.write_checkpoint(monitor, now);
+            while self.progress.borrow().ticket < ticket && Instant::now() < limit {
+                std::thread::sleep(Duration::from_millis(1));
+            }
+            let progress = *self.progress.borrow();
+            is_stored &= progress.ticket >= ticket && progress.works;
         }
-        let progress = *self.progress.borrow();
-        if progress.ticket < ticket || !progress.works {
+        if !is_stored {
             tracing::error!(
                 "state not stored before the first authenticated frame: a power cut may repeat its freshness"
             );
@@ -308,6 +312,15 @@ impl Store {
         if lost > 0 || !self.progress.borrow().works {
             tracing::error!(lost_rows = lost, "last state not stored");
         }
+    }
+
+    /// Waits until the writer has handled everything that was queued.
+    #[cfg(test)]
+    pub(crate) fn settle(&self) -> StoreProgress {
+        while self.progress.borrow().ticket < self.write_queue.submitted() {
+            std::thread::sleep(Duration::from_micros(50));
+        }
+        *self.progress.borrow()
     }
 
     /// Queues rows and the state for the writer. Returns the ticket.

@@ -19,6 +19,7 @@ use crate::io::clock::{MappedClock, Reading};
 use crate::io::csv_log::CsvOptions;
 use crate::io::log::{LogCounts, LogError, LogOptions, LogSource};
 use crate::io::reading::LogReading;
+use crate::io::runtime::new_runtime;
 use crate::io::socket::{PassiveSocket, explained};
 use crate::io::stop::Stop;
 use crate::monitor::{BusEvent, Monitor, Outputs, Record, RecordKind};
@@ -39,7 +40,7 @@ pub struct CheckProgress {
     pub seconds: f64,
 }
 
-/// Flag that ends the loops; SIGINT and SIGTERM set the flag.
+/// Flag that ends the loops; the signals of [`Stop`] set the flag.
 #[derive(Debug, Clone, Default)]
 pub struct Interrupt(Arc<AtomicBool>);
 
@@ -51,7 +52,7 @@ impl Interrupt {
     pub fn watch() -> std::io::Result<Self> {
         let interrupt = Self::default();
         let flag = Arc::clone(&interrupt.0);
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+        let runtime = new_runtime()?;
         let mut stop = runtime.block_on(async { Stop::new(None) })?;
         std::thread::spawn(move || {
             runtime.block_on(stop.wait());

@@ -23,6 +23,7 @@ mod series;
 mod summary;
 mod text;
 mod trace;
+mod usage;
 
 pub use context::PageContext;
 pub use data::{Data, DataSource, Origin};

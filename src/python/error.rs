@@ -4,6 +4,7 @@
 use std::fmt::Display;
 
 use packwatch_host::config::ConfigFaults;
+use packwatch_host::io::text_table::printable;
 use packwatch_lab::error::{LabError, RequestError};
 use pyo3::prelude::*;
 
@@ -51,19 +52,6 @@ pub(crate) fn file(error: impl Display) -> PyErr {
         let made = py.import("packwatch._errors").and_then(|module| module.call_method1("file_error", (text,)));
         made.map_or_else(|error| error, PyErr::from_value)
     })
-}
-
-/// The text with its control characters escaped, because an exception is printed to a terminal. Line ends are kept.
-fn printable(text: &str) -> String {
-    let mut safe = String::with_capacity(text.len());
-    for c in text.chars() {
-        if c.is_control() && c != '\n' {
-            safe.extend(c.escape_default());
-        } else {
-            safe.push(c);
-        }
-    }
-    safe
 }
 
 /// The faults of a configuration.

@@ -29,7 +29,8 @@ mod value_requests;
 
 use std::time::Duration;
 
-use tokio::signal::unix::{SignalKind, signal};
+use packwatch_host::io::runtime::new_runtime;
+use packwatch_host::io::stop::Stop;
 use tokio::sync::watch;
 use tokio::time::timeout;
 
@@ -49,8 +50,7 @@ pub(crate) const LONGEST_PAUSE: Duration = Duration::from_secs(8);
 /// Fails if the settings are invalid or the runtime cannot be started.
 pub fn run(options: &Options) -> Result<(), Failure> {
     let settings = options.start()?;
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
-    let runtime = runtime.map_err(|error| Failure::new(format!("runtime: {error}")))?;
+    let runtime = new_runtime().map_err(|error| Failure::new(format!("runtime: {error}")))?;
     runtime.block_on(serve(&settings)).map_err(|error| Failure::new(format!("signals: {error}")))
 }
 
@@ -83,15 +83,12 @@ async fn serve(settings: &Settings) -> std::io::Result<()> {
     Ok(())
 }
 
-/// Watches for `SIGTERM` and `SIGINT`; the value becomes true with the first signal.
+/// Watches for a signal that ends the program; the value becomes true with the first signal.
 fn stop_requests() -> std::io::Result<watch::Receiver<bool>> {
-    let (mut terminate, mut interrupt) = (signal(SignalKind::terminate())?, signal(SignalKind::interrupt())?);
+    let mut stop = Stop::new(None)?;
     let (sender, receiver) = watch::channel(false);
     tokio::spawn(async move {
-        tokio::select! {
-            _ = terminate.recv() => {}
-            _ = interrupt.recv() => {}
-        }
+        stop.wait().await;
         sender.send_replace(true);
         // The sender must stay alive, because all waits for a stop end when the sender is dropped.
         sender.closed().await;

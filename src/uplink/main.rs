@@ -4,6 +4,7 @@
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
+use packwatch_host::io::text_table::printable;
 use packwatch_uplink::{Options, kuksa, mqtt, sovd, vss};
 
 /// Send the status of the packwatch daemon to MQTT brokers, KUKSA databrokers and SOVD testers.
@@ -36,7 +37,7 @@ fn main() -> ExitCode {
     match result {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {
-            eprintln!("{}", failure.message);
+            eprintln!("{}", printable(&failure.message));
             ExitCode::from(failure.code)
         }
     }

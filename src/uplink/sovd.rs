@@ -17,6 +17,7 @@ use std::rc::Rc;
 use packwatch_host::http::{
     self, Bytes, Full, Response, StatusCode, answer_with, header, names_this_computer, reads, with,
 };
+use packwatch_host::io::runtime::new_runtime;
 use packwatch_host::io::stop::Stop;
 use packwatch_host::status::document::StatusDocument;
 use serde_json::Value;
@@ -27,15 +28,14 @@ use crate::status_stream::follow;
 use crate::{Failure, Options};
 use resources::Fault;
 
-/// Runs until SIGTERM or SIGINT.
+/// Runs until a signal of [`Stop`].
 ///
 /// # Errors
 /// Fails if the settings are invalid, or if the address cannot be bound.
 pub fn run(options: &Options) -> Result<(), Failure> {
     let settings = options.start()?;
     let listen = settings.sovd.listen;
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
-    let runtime = runtime.map_err(|error| Failure::new(format!("cannot start: {error}")))?;
+    let runtime = new_runtime().map_err(|error| Failure::new(format!("cannot start: {error}")))?;
     let served = LocalSet::new().block_on(&runtime, async {
         let mut stop = Stop::new(None)?;
         let listener = TcpListener::bind(listen).await?;

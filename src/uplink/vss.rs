@@ -72,6 +72,7 @@ fn description(branch: &str) -> &'static str {
         "RemainingLife" => "Remaining life of the cell that ends first.",
         "StateOfCharge" => "Additional signals of the state of charge.",
         "StateOfHealth" => "Additional signals of the state of health.",
+        "Use" => "How the pack was used.",
         _ => "Battery health estimated by packwatch.",
     }
 }

@@ -118,8 +118,16 @@ fn sleeping_bus_carries_only_changes_unless_configured() {
     rig.reload(|config| config.output.as_mut().unwrap().while_asleep = false).unwrap();
     frames_of(&mut rig, 1);
     assert_eq!(frames_of(&mut rig, 60), 0);
+    let before = rig.config.asleep_after_s;
+    rig.reload(|config| config.asleep_after_s = None).unwrap();
+    assert!(frames_of(&mut rig, 60) > 700, "no sleep is configured any more");
+    rig.reload(|config| config.asleep_after_s = before).unwrap();
+    frames_of(&mut rig, 1);
+    assert_eq!(frames_of(&mut rig, 60), 0);
     come_back(&mut rig);
     assert!(frames_of(&mut rig, 1) > 10, "awake");
+    let dm1 = |frame: &&Frame| frame.id().raw() & 0xFF_FF00 == 0xFE_CA00 || frame.id().raw() & 0xFF_0000 == 0xEC_0000;
+    assert!(rig.frames.iter().find(dm1).is_some(), "DM1, in one frame or announced: {:?}", rig.frames);
 }
 
 #[test]

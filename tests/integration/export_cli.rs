@@ -176,7 +176,7 @@ fn failed_log_leaves_no_table_others_continue() {
     let printed = bench.run(&["export", "--strict", "--out", "out", "bad.log", "life.log", "none.log"]).code(1);
     let stderr = String::from_utf8_lossy(&printed.get_output().stderr).into_owned();
     assert!(stderr.contains("bad.log:1:") && stderr.contains("none.log: cannot be read"), "{stderr}");
-    assert_eq!(fs::read_dir(bench.path("out/life")).unwrap().count(), 4);
+    assert_eq!(fs::read_dir(bench.path("out/life")).unwrap().count(), 5);
     for name in ["bad", "none"] {
         assert_eq!(fs::read_dir(bench.path("out").join(name)).unwrap().count(), 0, "{name}");
     }

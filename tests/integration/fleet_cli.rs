@@ -15,7 +15,7 @@ use parquet::file::reader::{FileReader, SerializedFileReader};
 use parquet::record::RowAccessor;
 use serde_json::Value;
 
-const TABLES: [&str; 4] = ["vehicles", "half_cycles", "alarms", "estimates"];
+const TABLES: [&str; 5] = ["vehicles", "half_cycles", "alarms", "use_record", "estimates"];
 
 struct Fleet {
     folder: tempfile::TempDir,
@@ -266,7 +266,7 @@ fn learned(label: &Label, capacity_ah: f64) -> LearnedModel {
         capacity: ScalarGaussian::from_std(capacity_ah, 0.02 * capacity_ah),
         residual_v: 0.005,
     };
-    LearnedModel { label: *label, own }
+    LearnedModel { label: *label, own, has_prior: false }
 }
 
 #[test]
@@ -281,13 +281,15 @@ fn prior_of_fleet_is_reproducible_and_configures_vehicle() {
     let models = [2.3, 2.4, 2.5, 2.4].map(|capacity_ah| learned(&nmc, capacity_ah));
     write("none", &[]);
     write("two", &models[..2]);
-    write("tables", &[&models[..], &[learned(&nca, 2.8)]].concat());
+    // A vehicle that started from a prior does not count: its model repeats the prior.
+    let repeated = LearnedModel { has_prior: true, ..learned(&nmc, 2.5) };
+    write("tables", &[&models[..], &[learned(&nca, 2.8), repeated]].concat());
     for (args, wanted) in [
-        (&["none"][..], "models of 0 wanted labels, must be 1 (vehicles with a model: none)"),
+        (&["none"][..], "no vehicle has a suitable model (vehicles with a model: none)"),
         (&["two"], "2 vehicles have a model of nmc811-graphite 2.6 Ah, 2.5 to 4.2 V, must be at least 3"),
         (
             &["tables"],
-            "models of 2 wanted labels, must be 1 (vehicles with a model: nmc811-graphite 2.6 Ah, 2.5 to 4.2 V: 4; nca",
+            "several labels, choose one by chemistry and rated capacity: nmc811-graphite 2.6 Ah, 2.5 to 4.2 V: 4; nca",
         ),
         (&["missing"], "missing/models.jsonl: "),
     ] {
@@ -320,7 +322,7 @@ fn prior_of_fleet_is_reproducible_and_configures_vehicle() {
         (
             2.5,
             "one.toml",
-            "is for nmc811-graphite 2.6 Ah, 2.5 to 4.2 V, must be for the cells of [pack]: nmc811-graphite 2.5 Ah",
+            "was made for nmc811-graphite 2.6 Ah, 2.5 to 4.2 V, but [pack] describes nmc811-graphite 2.5 Ah",
         ),
         (2.6, "damaged.toml", "the capacity of a learned model is -2.4"),
         (2.6, "list.toml", "must be a file of `packwatch fleet prior`: list.toml: unknown field `names`"),

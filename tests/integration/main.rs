@@ -92,5 +92,7 @@ mod tables;
 mod tuned_constants;
 mod uplink_cli;
 #[cfg(feature = "lab")]
+mod use_record;
+#[cfg(feature = "lab")]
 mod whatif_cli;
 mod yocto_recipe;

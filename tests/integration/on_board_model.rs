@@ -8,9 +8,11 @@ use std::path::Path;
 use packwatch::alarm::{Change, Rule};
 use packwatch::can::Frame;
 use packwatch::can::encode::InputEncoder;
+use packwatch::cell::chemistry::ResistanceFactors;
 use packwatch::cell::own_model::task::FitFindings;
-use packwatch::cell::{Branch, CellModel, Chemistry, FleetPrior, Table};
+use packwatch::cell::{Branch, CellModel, Chemistry, FleetPrior, Label, OwnModel, Table};
 use packwatch::config::{self, ConfigFiles};
+use packwatch::filter::ScalarGaussian;
 use packwatch::monitor::{Downtime, Event, EventKind, ModelState, Monitor, MonitorConfig, Outputs, Record, Snapshot};
 use packwatch::quantity::{BusIndex, CellIndex, Channel, Timestamp};
 use packwatch::sim::{Scenario, Settings, Simulation, Wiring};
@@ -319,6 +321,54 @@ fn corrected_label_keeps_rows_and_discards_model() {
     assert!(matches!(view.state, ModelState::Learning | ModelState::Learned), "{:?}", view.state);
 }
 
+/// A prior of ten equal vehicles with twice the resistance of the label's model.
+fn resistive_prior(label: &Label) -> FleetPrior {
+    let of_label = label.prior().unwrap();
+    let (modes_v, rest_v) = of_label.curve.modes_v();
+    let array = |values: &[f64]| std::array::from_fn(|s| values[s]);
+    let own = OwnModel {
+        curve_v: array(&of_label.curve.mean_v),
+        modes_v: modes_v.each_ref().map(|mode_v| array(mode_v)),
+        rest_v: array(&rest_v),
+        factors: ResistanceFactors { ln: [[2.0_f64.ln(); 9]; 4], by_temperature: [0.0; 4] },
+        drop_std: [0.05; 4],
+        cold_sag_v: ScalarGaussian::from_std(0.015, 0.015),
+        capacity: ScalarGaussian::from_std(4.5, 0.05),
+        residual_v: 0.005,
+    };
+    FleetPrior::new(label, &vec![own; 10]).unwrap()
+}
+
+#[test]
+fn prior_given_later_replaces_stored_resistance() {
+    let config = configuration("nmc811-graphite");
+    let mut live = Live::new(&config);
+    vehicle(&config.model, &config, TRUE_AH, &[(0.5, 0.85)], 1).iter().for_each(|frame| live.take(frame));
+    assert!(live.monitor.model().own.is_none(), "too little data for a model");
+    let stored = live.monitor.snapshot();
+    let last = live.monitor.latest().next().flatten().unwrap();
+    let fleet = resistive_prior(&config.label.unwrap());
+    let prior = configuration_from("nmc811-graphite", "", Some(&toml::to_string(&fleet).unwrap()));
+    let [kept, changed] = [&config, &prior].map(|config| {
+        let mut live = Live::new(config);
+        live.monitor.restore(stored.clone(), Downtime::Seconds(10.0)).unwrap();
+        let frames = vehicle(&config.model, config, TRUE_AH, &[(0.84, 0.85)], 1);
+        let first = frames[0].0;
+        let later = frames
+            .iter()
+            .take(40)
+            .map(|(time, bus, frame)| (last.time.plus_secs(10.0 + time.since(first)), *bus, *frame));
+        later.for_each(|frame| live.take(&frame));
+        live.monitor.latest().next().flatten().unwrap()
+    });
+    assert!((kept.capacity_ah - last.capacity_ah).abs() < 0.05, "{kept:?}");
+    // The resistance was learned relative to the label's model, and the prior knows the capacity better.
+    assert!((changed.resistance_ratio - 1.0).abs() < 0.01, "relative to the prior: {changed:?}");
+    assert!(changed.resistance_ratio_std > kept.resistance_ratio_std, "{kept:?} {changed:?}");
+    assert!((changed.capacity_ah - fleet.mean.capacity.mean).abs() < 0.05, "{changed:?}");
+    assert!((changed.soc - kept.soc).abs() < 0.05 && changed.soc_std < 0.1, "the SOC is kept: {kept:?} {changed:?}");
+}
+
 #[test]
 fn vehicle_starts_from_what_a_fleet_has_learned() {
     let config = configuration("nmc811-graphite");
@@ -354,4 +404,13 @@ fn vehicle_starts_from_what_a_fleet_has_learned() {
     });
     let [(_, label_std), (off, std)] = errors;
     assert!(std < 0.8 * label_std && off.abs() < 1.96 * std, "{errors:?}");
+    // The vehicle's own fit starts from the fleet, too.
+    let own = [&config, &prior].map(|config| {
+        let mut live = Live::new(config);
+        vehicle(&truth, config, TRUE_AH, &swings, 3).iter().for_each(|frame| live.take(frame));
+        live.give(Record::unknown_gap(Timestamp::from_secs(4e9)));
+        live.monitor.model().own.expect("a learned model").capacity
+    });
+    assert!((own[1].mean - TRUE_AH).abs() < 1.96 * own[1].std(), "{own:?}");
+    assert!(own[1].std() < own[0].std(), "{own:?}");
 }

@@ -16,9 +16,47 @@ use packwatch::can::encode::{
 };
 use packwatch::can::secoc::{self, Authentication};
 use packwatch::can::{CanId, Frame, FrameKind};
+use packwatch::quantity::catalogue::{Estimate, PackValues, Part, Quantity as Q};
 use packwatch::quantity::{CellIndex, Mode};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
+
+/// Energy, time and power in the health frame: page, signal, quantity, part, largest value.
+const OUTLOOK: [(usize, &str, Q, Part, f64); 18] = [
+    (5, "RemainingEnergy", Q::RemainingEnergy, Part::Mean, 1_048_574.0),
+    (5, "RemainingEnergyStd", Q::RemainingEnergy, Part::Std, 1_048_574.0),
+    (6, "EnergyToFull", Q::EnergyToFull, Part::Mean, 1_048_574.0),
+    (6, "EnergyToFullStd", Q::EnergyToFull, Part::Std, 1_048_574.0),
+    (7, "TimeToEmpty", Q::TimeToEmpty, Part::Mean, 163_820.0),
+    (7, "TimeToFull", Q::TimeToFull, Part::Mean, 163_820.0),
+    (7, "TimeToTarget", Q::TimeToTarget, Part::Mean, 163_820.0),
+    (8, "TimeToEmptyStd", Q::TimeToEmpty, Part::Std, 163_820.0),
+    (8, "TimeToFullStd", Q::TimeToFull, Part::Std, 163_820.0),
+    (8, "TimeToTargetStd", Q::TimeToTarget, Part::Std, 163_820.0),
+    (9, "DischargePower10s", Q::DischargePower10s, Part::Mean, 655_340.0),
+    (9, "DischargePower10sStd", Q::DischargePower10s, Part::Std, 655_340.0),
+    (10, "ChargePower10s", Q::ChargePower10s, Part::Mean, 655_340.0),
+    (10, "ChargePower10sStd", Q::ChargePower10s, Part::Std, 655_340.0),
+    (11, "DischargePower2s", Q::DischargePower2s, Part::Mean, 655_340.0),
+    (11, "DischargePower30s", Q::DischargePower30s, Part::Mean, 655_340.0),
+    (12, "ChargePower2s", Q::ChargePower2s, Part::Mean, 655_340.0),
+    (12, "ChargePower30s", Q::ChargePower30s, Part::Mean, 655_340.0),
+];
+const HEALTH_PAGES: [&str; 13] = [
+    "capacity",
+    "recharge",
+    "usable",
+    "life",
+    "losses",
+    "energy",
+    "energy_to_full",
+    "time",
+    "time_std",
+    "discharge_power",
+    "charge_power",
+    "discharge_powers",
+    "charge_powers",
+];
 
 /// Frames per message and configuration.
 const FRAMES: usize = 40;
@@ -190,6 +228,12 @@ impl Maker {
         let (usable, usable_std, ratio) = (self.below(largest_ah), self.below(largest_ah / 4.0), self.below(4.0));
         let (cycles, cycles_low, days) = (self.below(60_000.0), self.below(60_000.0), self.below(8_000.0));
         let losses = [(); 3].map(|()| [self.below(1.0), self.below(0.3)]);
+        let values = OUTLOOK.map(|(.., limit)| self.below(limit));
+        let mut outlook = PackValues::default();
+        for (n, (_, _, quantity, _, _)) in OUTLOOK.into_iter().enumerate().filter(|(_, it)| it.3 == Part::Mean) {
+            let std = OUTLOOK.iter().position(|it| (it.2, it.3) == (quantity, Part::Std)).map(|place| values[place]);
+            outlook.set(quantity, Some(Estimate { mean: values[n], std }));
+        }
         let fields = HealthFields {
             capacity_ah: Some(capacity),
             capacity_std_ah: Some(std),
@@ -206,6 +250,7 @@ impl Maker {
             lam_ne: losses[1].map(Some),
             lam_pe: losses[2].map(Some),
             model_state: Some(2),
+            outlook,
         };
         let mut wanted = match page {
             0 => self.wanted("Health", &[("Capacity", capacity), ("CapacityStd", std), ("Soh", 100.0 * soh)]),
@@ -228,6 +273,10 @@ impl Maker {
                     ("LamPeStd", 100.0 * losses[2][1]),
                 ],
             ),
+            5.. => {
+                let on_page = OUTLOOK.iter().zip(values).filter(|(it, _)| it.0 == page);
+                self.wanted("Health", &on_page.map(|(it, value)| (it.1, value)).collect::<Vec<_>>())
+            }
             _ => self.wanted(
                 "Health",
                 &[("RemainingCycles", cycles), ("RemainingCyclesLow", cycles_low), ("RemainingDays", days)],
@@ -607,7 +656,7 @@ fn dbc_timing_matches_contract_page() {
     const SEVERITIES: [(i64, &str); 4] = [(0, "none"), (1, "info"), (2, "warning"), (3, "severe")];
     const RULE_STATES: [&str; 6] = ["none", "info", "warning", "severe", "unknown", "not watched"];
     for (signal, named, last) in [
-        ("PACKWATCH_Health.Page", ["capacity", "recharge", "usable", "life", "losses"].as_slice(), 15),
+        ("PACKWATCH_Health.Page", HEALTH_PAGES.as_slice(), 15),
         ("PACKWATCH_Digest.Page", &["alarms", "rules", "threshold", "rules_2"], 15),
         ("PACKWATCH_Alarm.State", &["inactive", "active", "cleared", "pending", "latched", "suppressed", "unknown"], 7),
     ] {

@@ -126,6 +126,7 @@ PACK_NUMBERS = {
     "Charging.TimeToCompleteStandardDeviation": "time_to_full_std_s",
     "Energy.TimeToEmpty": "time_to_empty_s", "Energy.TimeToEmptyStandardDeviation": "time_to_empty_std_s",
     "Energy.TimeToTarget": "time_to_target_s", "Energy.TimeToTargetStandardDeviation": "time_to_target_std_s",
+    "Use.LimitEvents": "limit_events", "Use.FastCharges": "fast_charges", "Use.HighSocTime": "high_soc_time_s",
 } | {
     f"Power.{kind}{time}{name}": f"{kind.lower()}_power_{time}{key}_w" for kind in ("Discharge", "Charge")
     for time in ("2s", "10s", "30s") for name, key in (("", ""), ("StandardDeviation", "_std"))

@@ -41,7 +41,11 @@ def element(name, value):
 
 
 def listed(values):
-    """A list of document identifiers."""
+    """A list of negative events, or of document identifiers."""
+    if values and isinstance(values[0], dict):
+        event = {"modelType": "SubmodelElementCollection", "semanticId": semantic(MODEL + "NegativeEvent")}
+        items = [{**event, "value": [element(*member) for member in value.items()]} for value in values]
+        return {"typeValueListElement": "SubmodelElementCollection", "value": items}
     items = [{"modelType": "Property", "semanticId": semantic(DOCUMENT), "valueType": "xs:string", "value": value} for value in values]
     head = {"typeValueListElement": "Property", "valueTypeListElement": "xs:string"}
     return {**head, "value": items} if items else head

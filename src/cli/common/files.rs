@@ -5,7 +5,7 @@ use std::path::Path;
 use packwatch_host::bounded_file;
 use packwatch_host::failure::Failure;
 
-use super::output::named;
+use super::output::{named, note};
 use crate::can::dbc::{Database, DbcError};
 
 /// Reads a DBC file. Prints a warning for each message that is left out.
@@ -15,7 +15,7 @@ pub(crate) fn database(file: &Path) -> Result<Database, Failure> {
     let database =
         Database::parse_bytes(&bytes).map_err(|fault| Failure::new(format!("{}: {}", at(&fault), fault.what)))?;
     for fault in &database.left_out {
-        eprintln!("{}: warning: {}", at(fault), fault.what);
+        note(format_args!("{}: warning: {}", at(fault), fault.what));
     }
     Ok(database)
 }

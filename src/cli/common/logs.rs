@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use super::numbers::positive;
+use super::output::note;
 use crate::config::Config;
 #[cfg(feature = "lab")]
 use crate::io::csv_log::CsvOptions;
@@ -95,7 +96,7 @@ pub(crate) fn table_options(args: &InputArgs) -> CsvOptions {
 
 /// Prints what was read of each table, one line per table.
 pub(crate) fn print_tables(tables: &[TableReading]) {
-    tables.iter().for_each(|table| eprintln!("{table}"));
+    tables.iter().for_each(note);
 }
 
 pub(crate) fn column(text: &str) -> Result<(String, String), String> {

@@ -14,6 +14,7 @@ use serde::Serialize;
 use crate::io::paths;
 use packwatch_host::failure::Failure;
 
+pub(crate) use crate::io::text_table::printable;
 pub(crate) use crate::io::text_table::text_table as table;
 
 /// Makes a general failure from an error.
@@ -34,8 +35,18 @@ pub(crate) fn unless_closed(written: io::Result<()>) -> Result<(), Failure> {
     }
 }
 
-/// Writes to standard output.
+/// Writes a line for the user to standard error.
+pub(crate) fn note(text: impl Display) {
+    eprintln!("{}", printable(&text.to_string()));
+}
+
+/// Writes to standard output, without control characters.
 pub(crate) fn print(text: &str) -> Result<(), Failure> {
+    print_painted(&printable(text))
+}
+
+/// Writes to standard output. The text may contain colours, but no control characters from outside.
+pub(crate) fn print_painted(text: &str) -> Result<(), Failure> {
     let written = io::stdout().write_all(text.as_bytes());
     unless_closed(written).map_err(|failure| Failure::new(format!("standard output: {}", failure.message)))
 }

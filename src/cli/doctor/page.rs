@@ -3,7 +3,7 @@
 use std::io::IsTerminal as _;
 use std::path::Path;
 
-use crate::cli::common::output;
+use crate::cli::common::output::{self, printable};
 use crate::wiring::{Change, Severity, WiringFinding, WiringReport};
 use packwatch_host::failure::Failure;
 
@@ -16,7 +16,9 @@ struct Paint(bool);
 
 impl Paint {
     fn with(self, code: &str, text: &str) -> String {
-        if self.0 { format!("\u{1b}[{code}m{text}\u{1b}[0m") } else { text.to_owned() }
+        // The text may contain names from a file.
+        let text = printable(text);
+        if self.0 { format!("\u{1b}[{code}m{text}\u{1b}[0m") } else { text }
     }
 
     fn bold(self, text: &str) -> String {
@@ -34,12 +36,12 @@ pub(super) fn print(report: &WiringReport, config: &Path, source: &str) -> Resul
     let paint = Paint(is_terminal && std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty()));
     let width =
         if is_terminal { ratatui::crossterm::terminal::size().map_or(100, |(w, _)| usize::from(w)) } else { 100 };
-    output::print(&render(report, config, source, width.clamp(50, 120), paint))
+    output::print_painted(&render(report, config, source, width.clamp(50, 120), paint))
 }
 
 fn render(report: &WiringReport, config: &Path, source: &str, width: usize, paint: Paint) -> String {
     let (config, seconds, frames) = (config.display(), report.seconds, report.frames);
-    let mut page = format!("{source} with {config}: {seconds:.0} s, {frames} frames\n\n");
+    let mut page = printable(&format!("{source} with {config}: {seconds:.0} s, {frames} frames\n\n"));
     page.push_str(&format!("{}\n", paint.bold(&summary(report))));
     for finding in &report.findings {
         page.push('\n');
@@ -120,7 +122,12 @@ fn changes(changes: &[Change], paint: Paint, page: &mut String) {
             None => format!("{} is not set", change.key),
         };
         let label = if change.is_alternative { "or" } else { "change" };
-        page.push_str(&format!("{}{}  [{}]\n", paint.dim(&format!("  {label:8}")), place, change.table));
+        page.push_str(&format!(
+            "{}{}  [{}]\n",
+            paint.dim(&format!("  {label:8}")),
+            printable(place),
+            printable(&change.table)
+        ));
         page.push_str(&format!("{:INDENT$}{}\n", "", paint.with("31", &format!("- {now}"))));
         page.push_str(&format!("{:INDENT$}{}\n", "", paint.with("32", &proposal(change))));
     }
@@ -142,7 +149,7 @@ fn list(heading: &str, lines: &[String], width: usize, paint: Paint, page: &mut 
 /// Wraps text to at most `width`; indents all lines but the first.
 fn wrapped(text: &str, width: usize, indent: usize) -> String {
     let mut lines: Vec<String> = vec![String::new()];
-    for word in text.split_whitespace() {
+    for word in printable(text).split_whitespace() {
         let line = lines.last_mut().map_or(0, |line| line.chars().count());
         if line > 0 && indent + line + 1 + word.chars().count() > width {
             lines.push(word.to_owned());

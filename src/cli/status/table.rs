@@ -106,6 +106,15 @@ fn pack(text: &mut String, document: &StatusDocument) {
     }
     let _ = writeln!(text, "losses     {}", losses(&pack.values));
     let _ = writeln!(text, "life       {}", remaining(pack));
+    let [events, fast, high_soc] = [Quantity::LimitEvents, Quantity::FastCharges, Quantity::HighSocTime];
+    let count = |quantity| shown(pack.values.mean(quantity), 0, "");
+    let high_soc = pack.values.mean(high_soc).map_or_else(|| "-".to_owned(), duration);
+    let _ = writeln!(
+        text,
+        "use        events beyond limits {}, fast charges {}, at rest above 80 % {high_soc}",
+        count(events),
+        count(fast)
+    );
 }
 
 /// Describes the energy of the pack, and the time until it is empty or full.

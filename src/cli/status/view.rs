@@ -15,6 +15,7 @@ use std::io::{self, IsTerminal};
 use std::path::Path;
 use std::time::Duration;
 
+use packwatch_host::io::runtime::new_runtime;
 use ratatui::DefaultTerminal;
 use ratatui::crossterm::event::{self, Event, KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
 use tokio::signal::unix::{SignalKind, signal};
@@ -43,8 +44,7 @@ pub(super) fn run(socket: &Path) -> Result<(), String> {
     // If NO_COLOR is set and not empty, the view has no colours (https://no-color.org).
     let has_colour = std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty());
     let app = App::new(socket.to_owned(), has_colour);
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
-    let runtime = runtime.map_err(|error| format!("cannot start: {error}"))?;
+    let runtime = new_runtime().map_err(|error| format!("cannot start: {error}"))?;
     // After this call, a panic also restores the terminal.
     let terminal = ratatui::try_init().map_err(|error| format!("terminal: {error}"))?;
     let watched = runtime.block_on(watch(terminal, app));

@@ -26,12 +26,21 @@
 //! Time counts only between two observations of known values on the same side. The time between a known and an unknown
 //! value does not count. For a learned value, time also counts up to each poll, because the value stays valid. An
 //! unknown value does not reset the count; otherwise, a flickering input could prevent an alarm forever.
+//!
+//! The end of an alarm and the change to `suppressed` are limited: [`QUICK_ENDS`] in short succession, then one per
+//! [`END_PERIOD_S`]. Until one is allowed, the alarm stays raised and no change is published; cyclic frames still show
+//! an unknown value as `suppressed`. A flickering input therefore fills neither the bus nor the history.
 
 use serde::{Deserialize, Serialize};
 use strum::IntoStaticStr;
 
 use super::limit::{LimitCheck, Observation, RuleConfig};
 use crate::quantity::Timestamp;
+
+/// Number of ends in short succession. A person at work on the vehicle causes fewer.
+const QUICK_ENDS: i64 = 120;
+/// Time between further ends, s. An alarm then changes at most 288 times a day.
+const END_PERIOD_S: f64 = 600.0;
 
 /// State of an alarm.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
@@ -137,6 +146,9 @@ pub(super) struct Machine {
     counted_to: Option<Timestamp>,
     /// Whether the inputs of a learned value are invalid now.
     is_suspended: bool,
+    /// Time from which all [`QUICK_ENDS`] are available again.
+    #[serde(default)]
+    rested_at: Timestamp,
 }
 
 /// Properties of an alarm that the engine counts and lists.
@@ -173,7 +185,7 @@ impl Machine {
     /// change its state; otherwise, the value would clear the alarm or make it look up to date.
     pub(super) fn observe(&mut self, now: Timestamp, rule: &RuleConfig, observation: &Observation) -> Option<Change> {
         self.observation = *observation;
-        if self.is_suspended && self.state == AlarmState::Suppressed {
+        if self.is_suspended && self.shown() == AlarmState::Suppressed {
             return None;
         }
         self.is_suspended = false;
@@ -276,7 +288,8 @@ impl Machine {
     pub(super) fn restored(self, now: Timestamp) -> Self {
         let (first_raised, last_raised) = (self.first_raised.min(now), self.last_raised.min(now));
         let value = Observation::default();
-        Self { is_known: false, observation: value, probability: None, first_raised, last_raised, ..self }
+        let rested_at = self.rested_at.min(now.plus_secs(QUICK_ENDS as f64 * END_PERIOD_S));
+        Self { is_known: false, observation: value, probability: None, first_raised, last_raised, rested_at, ..self }
     }
 
     /// Enters a state that fits the published state `shown`. The debounce starts again.
@@ -292,6 +305,20 @@ impl Machine {
         self.first_raised = self.first_raised.plus_nanos(by_nanos);
         self.last_raised = self.last_raised.plus_nanos(by_nanos);
         self.counted_to = self.counted_to.map(|stamp| stamp.plus_nanos(by_nanos));
+        self.rested_at = self.rested_at.plus_nanos(by_nanos);
+    }
+
+    /// Whether the alarm may end now. If so, counts the end.
+    fn take_end(&mut self, now: Timestamp) -> bool {
+        let latest = now.plus_secs(QUICK_ENDS as f64 * END_PERIOD_S);
+        // After a backward step of the clock, the stored time may be far ahead.
+        self.rested_at = self.rested_at.min(latest);
+        let rested_at = self.rested_at.max(now).plus_secs(END_PERIOD_S);
+        let is_allowed = rested_at <= latest;
+        if is_allowed {
+            self.rested_at = rested_at;
+        }
+        is_allowed
     }
 
     fn judge(&mut self, now: Timestamp, rule: &RuleConfig) -> Option<Change> {
@@ -325,8 +352,11 @@ impl Machine {
             (Pending | Suppressed | Latched, LimitCheck::Unknown) => self.counted_to = None,
             // Keep the count towards the end.
             (Active | Clearing, LimitCheck::Unknown) => {
-                (self.state, self.counted_to) = (Suppressed, None);
-                return Some(Change::Suppressed);
+                self.counted_to = None;
+                if self.take_end(now) {
+                    self.state = Suppressed;
+                    return Some(Change::Suppressed);
+                }
             }
         }
         None
@@ -356,11 +386,11 @@ impl Machine {
                 }
                 None
             }
-            (false, true) => {
+            (false, true) if self.take_end(now) => {
                 self.enter(if rule.is_latching { AlarmState::Latched } else { self.rest() });
                 Some(if rule.is_latching { Change::Latched } else { Change::Cleared })
             }
-            (false, false) => {
+            (false, _) => {
                 let before = std::mem::replace(&mut self.state, AlarmState::Clearing);
                 (before == AlarmState::Suppressed).then_some(Change::Resumed)
             }

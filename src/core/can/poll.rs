@@ -402,8 +402,13 @@ impl Poller {
         asleep.into_iter().chain(supply).chain(request).min()
     }
 
-    fn silence_at(&self, now: Timestamp) -> Option<PollSilence> {
+    /// Whether no frame has been heard on a polled bus lately.
+    pub fn is_bus_asleep(&self, now: Timestamp) -> bool {
         let is_asleep = |(_, at): &(BusIndex, Timestamp)| now.nanos().saturating_sub(at.nanos()) >= ASLEEP_AFTER_NS;
+        self.progress.heard.iter().any(is_asleep)
+    }
+
+    fn silence_at(&self, now: Timestamp) -> Option<PollSilence> {
         if self.progress.is_standby {
             Some(PollSilence::Standby)
         } else if self.progress.hears_tester(now) {
@@ -411,7 +416,7 @@ impl Poller {
         } else if self.config.watches_supply && now >= self.progress.supply_good_until {
             Some(PollSilence::LowSupply)
         } else {
-            self.progress.heard.iter().any(is_asleep).then_some(PollSilence::BusAsleep)
+            self.is_bus_asleep(now).then_some(PollSilence::BusAsleep)
         }
     }
 

@@ -17,8 +17,8 @@ use serde::{Deserialize, Serialize};
 
 use super::aged_ocv::{AgedOcv, MIXES};
 use super::electrodes::{Electrodes, NegativeMaterial as Negative, PositiveMaterial as Positive};
-use super::fleet_prior::FleetPrior;
 use super::model::{Branch, CellModel, ModelSpread, Table, arrhenius};
+use super::own_model::OwnModel;
 use crate::filter::{ScalarGaussian, interpolate, median};
 use curve::{CellType, CurvePrior, PositiveElectrode};
 
@@ -107,17 +107,24 @@ pub struct Label {
     pub voltage_max_v: f64,
 }
 
-/// What is known about a cell from its label alone.
+/// What is known about a cell before its own data: from its label alone ([`Label::prior`]), or also from other vehicles
+/// ([`FleetPrior::prior`](super::FleetPrior::prior)).
 #[derive(Debug, Clone)]
 pub struct LabelPrior {
     /// The label.
     pub label: Label,
-    /// Model of the mean cell.
+    /// Model of the label's mean cell.
     pub model: CellModel,
-    /// Open-circuit curve with the covariance between cells.
+    /// Open-circuit curve of the label's mean cell, and the covariance between cells.
     pub curve: CurvePrior,
-    /// What other vehicles have learned about cells of this label; `None` = only the label is known.
-    pub fleet: Option<FleetPrior>,
+    /// Expected model; `None` = the label's mean cell.
+    pub expected: Option<OwnModel>,
+    /// Standard deviation of ln(resistance) between cells, relative to the standard deviation of the label.
+    pub log_resistance_ratio: f64,
+    /// Standard deviation of the fall of the curve in the cold (V).
+    pub cold_sag_std_v: f64,
+    /// Standard deviation of the capacity, fraction.
+    pub capacity_std: f64,
 }
 
 /// SOC breakpoints of a model from a label.
@@ -272,7 +279,16 @@ impl Label {
         let of_cells = CurveOfCells { mean_v, modes_v, rest_v, cold_sag_v: usual_cold_sag_v(), electrodes };
         let factors = ResistanceFactors::default();
         let model = self.model_of(self.rated_ah, &of_cells, &factors, &[0.0; TEMPERATURE_NODES], spread);
-        Some(LabelPrior { label: *self, model, curve, fleet: None })
+        let (capacity_std, cold_sag_std_v) = (spread.capacity, usual_cold_sag_v().std());
+        Some(LabelPrior {
+            label: *self,
+            model,
+            curve,
+            expected: None,
+            log_resistance_ratio: 1.0,
+            cold_sag_std_v,
+            capacity_std,
+        })
     }
 
     /// The model of a cell with this present capacity (Ah), curve and resistances. `drop_std` is the standard deviation

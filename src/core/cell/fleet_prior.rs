@@ -1,26 +1,27 @@
 //! Combines the models that many vehicles have learned for one label into a prior for the next vehicle.
 //!
-//! In: one [`OwnModel`] per vehicle. Out: a [`FleetPrior`], which replaces the values that are typical of the chemistry.
+//! In: one [`OwnModel`] per vehicle. Out: a [`FleetPrior`], which replaces the values that are typical of the
+//! chemistry.
 //!
-//! Each quantity (the curve at each SOC, a resistance, the capacity) varies between the cells of the label with an unknown
-//! variance P. A vehicle's fit gives the mean m and the posterior variance V; it started from the label's variance L. The
-//! variance of the means over the vehicles contains the part of P that the data showed, and the errors of the fits. The
-//! data did not show the part V^2 / L, which is the share of the label's uncertainty in V (Joseph's form of the update).
-//! The estimate of P is the sum of both. For the curve, L is a covariance between the SOC, and each vehicle scales it at
-//! each SOC by V / L. Few vehicles say little about P, so the label's covariance counts as [`LABEL_VEHICLES`] more
-//! vehicles.
+//! Each quantity (the curve at each SOC, a resistance, the capacity) varies between the cells of the label with an
+//! unknown variance P. A vehicle's fit gives the mean m and the posterior variance V; it started from the label's
+//! variance L. A fit pulls its mean toward the label's mean, so the means vary less than the cells. The missing part is
+//! V^2 / L: the share of V that comes from the label (Joseph form of the update). The estimate of P is the variance of
+//! the means plus this part. For the curve, L is a covariance matrix over the SOC breakpoints. Each vehicle scales its
+//! rows and columns by V / L at that SOC. Few vehicles say little about P, so the label's covariance counts as
+//! [`LABEL_VEHICLES`] more vehicles.
 
 use nalgebra::DMatrix;
 use serde::{Deserialize, Serialize};
 
 use super::chemistry::curve::{CurvePrior, information};
-use super::chemistry::{Label, ResistanceFactors, SOC, TEMPERATURE_C, TEMPERATURE_NODES, usual_cold_sag_v};
+use super::chemistry::{Label, LabelPrior, ResistanceFactors, SOC, TEMPERATURE_C, TEMPERATURE_NODES, usual_cold_sag_v};
 use super::model::{CellModel, ModelSpread};
 use super::own_model::{OwnModel, SOC_NODES};
 use crate::filter::ScalarGaussian;
 use crate::quantity::InvalidState;
 
-/// Number of vehicles that the label counts for.
+/// Weight of the label's variance, as a number of vehicles.
 const LABEL_VEHICLES: f64 = 2.0;
 
 /// What is known about a cell of a label after other vehicles with this label have learned their models.
@@ -42,6 +43,9 @@ pub struct FleetPrior {
 impl FleetPrior {
     /// Combines the models of the vehicles of one label. `None` without vehicles, or if the label has no model.
     pub fn new(label: &Label, vehicles: &[OwnModel]) -> Option<Self> {
+        if vehicles.is_empty() {
+            return None;
+        }
         let prior = label.prior()?;
         let label_spread = prior.model.spread?;
         let models: Vec<CellModel> = vehicles.iter().map(|own| own.cell_model(label)).collect::<Option<_>>()?;
@@ -113,8 +117,22 @@ impl FleetPrior {
         Some(CurvePrior { soc: SOC.to_vec(), mean_v, covariance, electrodes: label.electrodes })
     }
 
+    /// What is known about the next cell of this label; `None` if the label has no model.
+    pub fn prior(&self) -> Option<LabelPrior> {
+        let of_label = self.label.prior()?;
+        let capacity = self.mean.capacity;
+        Some(LabelPrior {
+            curve: CurvePrior { covariance: self.covariance(), ..of_label.curve },
+            expected: Some(self.mean.clone()),
+            log_resistance_ratio: (self.spread.log_resistance / of_label.model.spread?.log_resistance).min(1.0),
+            cold_sag_std_v: self.mean.cold_sag_v.std(),
+            capacity_std: capacity.std() / capacity.mean,
+            ..of_label
+        })
+    }
+
     /// Covariance of the curve (V^2).
-    pub(super) fn covariance(&self) -> DMatrix<f64> {
+    fn covariance(&self) -> DMatrix<f64> {
         DMatrix::from_fn(SOC_NODES, SOC_NODES, |a, b| self.curve_covariance_v2[a][b])
     }
 
@@ -131,6 +149,20 @@ impl FleetPrior {
     /// The first impossible number.
     pub fn check(&self) -> Result<(), InvalidState> {
         self.mean.check()?;
+        InvalidState::unless(self.vehicles > 0, "the vehicles of a prior", f64::from(self.vehicles), "at least 1")?;
+        let Label { rated_ah, voltage_min_v, voltage_max_v, .. } = self.label;
+        let capacity_ah = self.mean.capacity.mean;
+        let is_near = (0.4 * rated_ah..=1.4 * rated_ah).contains(&capacity_ah);
+        InvalidState::unless(is_near, "the capacity of a prior", capacity_ah, "0.4 to 1.4 of the rated capacity")?;
+        let mut ends_v = [self.mean.curve_v[0], self.mean.curve_v[SOC_NODES - 1]].into_iter();
+        let beyond = ends_v.find(|v| !(voltage_min_v - 0.5..=voltage_max_v + 0.5).contains(v));
+        let what = "the curve of a prior";
+        InvalidState::unless(
+            beyond.is_none(),
+            what,
+            beyond.unwrap_or_default(),
+            "within 0.5 V of the label's voltages",
+        )?;
         let rows = &self.curve_covariance_v2;
         let is_square = rows.len() == SOC_NODES && rows.iter().all(|row| row.len() == SOC_NODES);
         let what = "the number of rows of the curve's covariance";
@@ -141,7 +173,7 @@ impl FleetPrior {
         InvalidState::unless(is_valid, what, variances[(0, 0)], "symmetric and positive definite")?;
         let ModelSpread { curve_v, log_resistance, slow_branch, capacity, drop_sqrt_s } = self.spread;
         let spreads = [curve_v, log_resistance, slow_branch, capacity, drop_sqrt_s];
-        InvalidState::unless_naturals("a spread between cells", spreads)
+        spreads.into_iter().try_for_each(|spread| InvalidState::unless_positive("a spread between cells", spread))
     }
 }
 

@@ -26,8 +26,8 @@ pub const POWER_S: [f64; 3] = [2.0, 10.0, 30.0];
 const LOAD_S: f64 = 1800.0;
 /// Standard deviation of ln(time that the charger holds the voltage). Models without a slow branch taper too fast.
 const LOG_HELD_STD: f64 = 0.7;
-/// A load is known if its mean is at least this share of its RMS value. A smaller share is charged and discharged in turn,
-/// as in a hybrid, so that no discharge can be foreseen.
+/// A load is known if its mean is at least this share of its RMS value. If the mean is smaller, charge and discharge
+/// alternate, as in a hybrid, and no time to empty can be forecast.
 const LEAST_MEAN: f64 = 0.1;
 /// Standard deviation of ln(future load over recent load): a driver needs a third more or less in the next half hour.
 const LOG_LOAD_STD: f64 = 0.3;
@@ -54,6 +54,10 @@ pub struct OutlookConfig {
     pub max_discharge_a: Option<f64>,
     /// Largest current of a charge (A); `None` = only the voltages limit it.
     pub max_charge_a: Option<f64>,
+    /// Lowest temperature (degrees C); `None` = no limit. Only the record of use applies it.
+    pub min_temperature_c: Option<f64>,
+    /// Highest temperature (degrees C); `None` = no limit. Only the record of use applies it.
+    pub max_temperature_c: Option<f64>,
     /// A charge is complete when its current has fallen to this value (A).
     pub taper_current_a: f64,
     /// SOC for which the time of a charge is stated, fraction.
@@ -89,7 +93,7 @@ impl Average {
         self.peak_a = current_a.max(self.peak_a + weight * (self.mean_a - self.peak_a));
     }
 
-    /// The load, unless it is unknown.
+    /// The load; `None` if its mean is below [`LEAST_MEAN`] of its RMS value.
     fn load(&self) -> Option<Load> {
         let Self { mean_a, mean_square_a2, peak_a, .. } = *self;
         let is_known = mean_a > LEAST_MEAN * mean_square_a2.sqrt();
@@ -294,8 +298,8 @@ impl CellNow<'_> {
         })
     }
 
-    /// Open-circuit voltage less the relaxing branches (V), and resistance (ohm), `after_s` after the current has changed
-    /// to `current_a`, positive = discharge.
+    /// Open-circuit voltage less the relaxing branches (V), and resistance (ohm), `after_s` after the current has
+    /// changed to `current_a`, positive = discharge.
     fn response(&self, current_a: f64, after_s: f64) -> (f64, f64) {
         let (model, position) = (self.model, self.position(self.soc.mean));
         let moved = current_a * after_s / (3600.0 * self.capacity.mean);
@@ -329,8 +333,9 @@ impl CellNow<'_> {
         (open_v - signed_a * ohm).max(0.0)
     }
 
-    /// A value of the cell with its variance. `value` is computed again with each of SOC, capacity and ln resistance one
-    /// standard deviation higher and lower; the larger change counts, because a SOC of 0 or 1 changes to one side only.
+    /// A value of the cell with its variance. `value` is computed again with each of SOC, capacity and ln resistance
+    /// one standard deviation higher and lower; the larger change counts, because a SOC of 0 or 1 changes to one side
+    /// only.
     fn spread(&self, value: impl Fn(&Self) -> f64) -> ScalarGaussian {
         let mean = value(self);
         let part = |change: fn(&mut Self, f64)| {
@@ -418,7 +423,8 @@ pub fn of_pack(
         mean: sum(value),
         variance: square(sum(&|_| 1.0)) * one.variance,
     };
-    // A value at this load, with the error of the cell and of the future load.
+    // Computes a value of the weakest cell at this load. The variance contains the errors of the cell and of the future
+    // load.
     let loaded = |load: Load, value: &dyn Fn(&CellNow<'_>, &Load) -> f64| {
         let known = weakest.spread(|cell| value(cell, &load));
         let changes = [-LOG_LOAD_STD, LOG_LOAD_STD].map(|log| value(weakest, &load.times(libm::exp(log))) - known.mean);

@@ -306,6 +306,7 @@ impl MonitorConfig {
             (
                 "[pack]",
                 self.model == new.model
+                    && self.fleet == new.fleet
                     && self.is_balanced == new.is_balanced
                     && old_sample.ambient_c == new_sample.ambient_c,
             ),

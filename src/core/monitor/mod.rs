@@ -249,7 +249,7 @@ impl Monitor {
                     stages.sampling.has_second_sender = intake.second_senders().next().is_some();
                     stages.run_housekeeping(now, intake.bus_fault(now, config.interfaces), silence, out);
                 }
-                stages.sending.set_asleep(now, stages.sleep.since.is_some());
+                stages.sending.set_asleep(now, stages.sleep.is_asleep());
                 if stages.sending.take_freshness_due(now) {
                     let freshness = intake.command_gate.announce(now);
                     stages.sending.send_freshness(now, config.commands.as_ref().map(|of| of.bus), freshness, out);
@@ -282,7 +282,7 @@ impl Monitor {
     /// Freshness of the last authenticated frame. The driver must store the state before this number has risen by
     /// [`RESTART_FRESHNESS`] since the last stored state.
     pub fn sent_freshness(&self) -> u64 {
-        self.stages.sending.sent_freshness()
+        self.stages.sending.schedule.sent_freshness
     }
 
     /// How to check the authenticator of a frame; `None` if the frame does not belong to an authenticated message. The
@@ -353,7 +353,7 @@ impl Monitor {
         }
         self.intake.command_gate.begin(time);
         if beginning == Beginning::New {
-            stages.sending.begin_freshness(time);
+            stages.sending.schedule.begin_freshness(time);
         } else {
             stages.restate_known(taken, was_brief, false, out);
         }
@@ -371,7 +371,7 @@ impl Monitor {
     /// Starts the freshness of commands and sent frames above the values of all earlier runs.
     fn begin_freshness(&mut self, now: Timestamp) {
         self.intake.command_gate.begin(now);
-        self.stages.sending.begin_freshness(now);
+        self.stages.sending.schedule.begin_freshness(now);
     }
 
     /// Advances the clock to the time of an input.
@@ -388,6 +388,7 @@ impl Monitor {
             TimeJump::Backwards { seconds } => {
                 self.stages.step_waiting(self.clock.now, true, out);
                 out.events.push(Event { time, kind: EventKind::TimeBackwards { seconds } });
+                self.stages.sending.schedule.step_back(seconds);
                 self.handle_unknown_gap(time, out);
             }
             TimeJump::Asleep { seconds } => {

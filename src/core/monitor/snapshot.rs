@@ -10,6 +10,7 @@ use crate::alarm::AlarmChange;
 use crate::cell::Label;
 use crate::cell_faults::{CellFaultDetector, Imbalance, UnknownImbalance};
 use crate::filter::ScalarGaussian;
+use crate::health::UseRecord;
 use crate::monitor::message::Downtime;
 use crate::monitor::stage::alarming::StoredAlarming;
 use crate::monitor::stage::estimation::EstimationState;
@@ -156,6 +157,11 @@ impl Snapshot {
     /// Throughput of each cell of the connected pack.
     pub fn throughputs(&self) -> Vec<Throughput> {
         self.cells.iter().map(|cell| cell.health.throughput).collect()
+    }
+
+    /// How the connected pack was used.
+    pub fn use_record(&self) -> &UseRecord {
+        self.learning.use_counter.record()
     }
 
     /// Rated capacity (Ah) that was configured when the life forecast of the first cell started; `None` without cells.

@@ -5,6 +5,7 @@
 
 mod outlook;
 pub(crate) mod pack_memory;
+mod use_record;
 pub(crate) mod watch;
 
 use pack_memory::PackMemory;
@@ -27,6 +28,7 @@ use crate::can::encode::{HealthFields, StatusFields};
 use crate::can::poll::CarState;
 use crate::filter::ScalarGaussian;
 use crate::health::ModeChange;
+use crate::quantity::catalogue::PackValues;
 use crate::quantity::{BusIndex, CellIndex, Channel, Mode, Reading, Timestamp};
 use crate::sample::{CellSample, Moment};
 
@@ -392,6 +394,7 @@ impl Stages {
             self.complete_mode(now, change, out);
         }
         self.learning.state.learned_at = None;
+        self.learning.state.use_counter.interrupt();
     }
 
     /// Continues at `time` after a gap of unknown length.
@@ -433,6 +436,7 @@ impl Stages {
         self.estimation.is_current_doubtful = self.sampling.has_second_sender || is_current_frozen || is_contradicted;
         self.findings.watch_current(now, is_current_frozen, out);
         if is_judged {
+            self.count_use(now);
             self.watch(now, out);
         }
         self.watch_computer(now, bus_fault, out);
@@ -455,8 +459,13 @@ impl Stages {
             self.sending.send_status(now, &fields, out);
         }
         if is_health_due {
+            let mut outlook = PackValues::default();
+            if self.sending.has_outlook() {
+                let _ = self.set_outlook(&mut outlook);
+            }
             let fields = HealthFields {
                 model_state: Some(self.modelling.view().state.code()),
+                outlook,
                 ..self.learning.health_fields(&self.estimation.bank)
             };
             self.sending.send_health(now, &fields, out);
@@ -534,7 +543,7 @@ impl Stages {
         let seconds = Some(now.since(since));
         out.events.push(Event { time: now, kind: EventKind::BusAsleep { asleep: false, seconds } });
         self.sampling.sampler.wake(now);
-        self.sending.restart(now);
+        self.sending.wake(now, since);
     }
 
     /// Whether a reading of this channel ends a bus sleep. A reading of the supply voltage does not, because the

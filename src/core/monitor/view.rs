@@ -17,8 +17,7 @@ use crate::can::poll::PollSilence;
 use crate::cell::LossModes;
 use crate::cell_faults::{CellFault, Difference};
 use crate::filter::ScalarGaussian;
-use crate::health::outlook::Outlook;
-use crate::health::{InsufficientData, PackState, RemainingLife};
+use crate::health::{InsufficientData, PackState, RemainingLife, UseRecord};
 use crate::quantity::catalogue::{CellValues, Estimate, PackValues, Quantity, RECORDED, Values};
 use crate::quantity::{BusIndex, CellIndex, Channel, Mode, Timestamp};
 use crate::sample::ReadingCounts;
@@ -212,6 +211,11 @@ impl Monitor {
         self.stages.learning.lives.of_pack()
     }
 
+    /// How the connected pack was used.
+    pub fn use_record(&self) -> &UseRecord {
+        self.stages.learning.state.use_counter.record()
+    }
+
     /// The alarm engine with the raised alarms.
     pub fn alarms(&self) -> &AlarmEngine {
         &self.stages.alarming.engine
@@ -263,7 +267,7 @@ impl Monitor {
         let weakest = learning.weakest();
         let weakest_cell = weakest.and_then(|(index, _)| estimation.cell_indices().nth(index));
         let capacity = weakest.map(|(_, capacity)| capacity);
-        let hottest = sampler.hottest_c(now);
+        let sensors = sampler.temperature_range_c(now);
         let soc = pack.map(|pack| ScalarGaussian::from_std(pack.soc, pack.soc_std));
         let edge = |sign: f64| soc.map(|soc| (soc.mean + sign * Z95 * soc.std()).clamp(0.0, 1.0));
         let usable = health.usable_capacity_ah.zip(health.usable_capacity_std_ah);
@@ -281,7 +285,7 @@ impl Monitor {
         values.set(Quantity::Voltage, sampling.pack_voltage_v(estimation.cell_indices(), now));
         values.set(Quantity::Current, sampler.pack_current_a(now));
         values.set(Quantity::CurrentOffset, self.current_offset());
-        values.set(Quantity::TemperatureMax, hottest.and_then(|(hottest_c, is_whole)| is_whole.then_some(hottest_c)));
+        values.set(Quantity::TemperatureMax, sensors.filter(|it| it.is_whole).map(|it| it.highest));
         values.set(Quantity::Capacity, capacity);
         values.set(Quantity::UsableCapacity, usable.map(|(mean, std)| Estimate { mean, std: Some(std) }));
         values.set(Quantity::Soh, soh);
@@ -291,39 +295,32 @@ impl Monitor {
         set_losses(&mut values, weakest_cell.and_then(|cell| self.loss_modes(cell)));
         set_remaining_life(&mut values, life.map(|(_, life)| life));
         values.set(Quantity::EnergySoh, self.stages.energy_soh());
-        let outlook = self.stages.outlook();
-        set_outlook(&mut values, outlook.as_ref());
+        let power_limiting_cells = self.stages.set_outlook(&mut values);
+        set_use(&mut values, self.use_record());
         PackView {
             validity: self.stages.validity(),
             mode: learning.mode(),
             limiting_cell: pack.map(|pack| pack.limiting_cell),
-            power_limiting_cells: outlook.map(|outlook| outlook.limiting_cells),
+            power_limiting_cells,
             weakest_cell,
             shortest_lived_cell: life.map(|(cell, _)| cell),
             model_state: Some(model.state),
             model_fits_better: model.chemistry,
             moved: Some(learning.state.moved.sums),
+            use_record: Some(*self.use_record()),
             values,
         }
     }
 }
 
-fn set_outlook(values: &mut PackValues, outlook: Option<&Outlook>) {
-    use Quantity as Q;
-    let mut set = |quantity, value: Option<ScalarGaussian>| values.set(quantity, value);
-    set(Q::RemainingEnergy, outlook.map(|it| it.remaining_wh));
-    set(Q::EnergyToFull, outlook.map(|it| it.to_full_wh));
-    set(Q::TimeToEmpty, outlook.and_then(|it| it.to_empty_s));
-    set(Q::TimeToFull, outlook.and_then(|it| it.to_full_s));
-    set(Q::TimeToTarget, outlook.and_then(|it| it.to_target_s));
-    let powers = [
-        [Q::DischargePower2s, Q::DischargePower10s, Q::DischargePower30s],
-        [Q::ChargePower2s, Q::ChargePower10s, Q::ChargePower30s],
-    ];
-    for (k, [discharge, charge]) in (0..3).map(|k| (k, powers.map(|times| times[k]))) {
-        set(discharge, outlook.map(|it| it.discharge_w[k]));
-        set(charge, outlook.map(|it| it.charge_w[k]));
-    }
+/// Sets the counts of use. A count is unknown until it could have been above 0.
+fn set_use(values: &mut PackValues, record: &UseRecord) {
+    let UseRecord { temperature_c, voltage_v, current_a, half_cycles, rest, .. } = record;
+    let is_judged = [temperature_c, voltage_v, current_a].iter().all(|it| it.below.known_s + it.above.known_s > 0.0);
+    let number = |count: u64, is_known: bool| is_known.then_some(count as f64);
+    values.set(Quantity::LimitEvents, number(record.events(), is_judged));
+    values.set(Quantity::FastCharges, number(half_cycles.fast_charges, half_cycles.charges > 0));
+    values.set(Quantity::HighSocTime, (rest.known_s > 0.0).then_some(rest.above_80_s));
 }
 
 fn set_losses<const IS_PACK: bool>(values: &mut Values<IS_PACK>, losses: Option<LossModes>) {

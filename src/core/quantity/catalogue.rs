@@ -78,6 +78,8 @@ pub enum Unit {
     Days,
     /// Equivalent full cycles.
     Cycles,
+    /// Number of things or events.
+    Count,
 }
 
 impl Unit {
@@ -95,6 +97,7 @@ impl Unit {
             Self::Seconds => "s",
             Self::Days => "days",
             Self::Cycles => "cycles",
+            Self::Count => "count",
         }
     }
 }
@@ -208,6 +211,9 @@ pub enum Quantity {
     ChargePower2s,
     ChargePower10s,
     ChargePower30s,
+    LimitEvents,
+    FastCharges,
+    HighSocTime,
 }
 
 impl Quantity {

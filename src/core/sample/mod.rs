@@ -19,4 +19,4 @@ pub mod signal;
 pub use cell_sample::{CellSample, Moment};
 pub use config::{ContactorConfig, Limits, SampleConfig, VoltageSource};
 pub use counts::ReadingCounts;
-pub use sampler::{Sampler, SamplerState, SignalChange};
+pub use sampler::{Sampler, SamplerState, SensorRange, SignalChange};

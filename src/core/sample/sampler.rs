@@ -32,6 +32,35 @@ pub struct SignalChange {
     pub state: Result<u64, Fault>,
 }
 
+/// Lowest and highest value of several sensors at one time.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SensorRange {
+    pub lowest: f64,
+    pub highest: f64,
+    /// Whether the values of all sensors are known.
+    pub is_whole: bool,
+}
+
+impl SensorRange {
+    /// The range of a single sensor.
+    pub fn of(value: f64) -> Self {
+        Self { lowest: value, highest: value, is_whole: true }
+    }
+
+    /// The range of several sensors; `None` = no value is known.
+    fn among(values: impl Iterator<Item = Option<f64>>) -> Option<Self> {
+        let (mut lowest, mut highest, mut is_whole) = (f64::INFINITY, f64::NEG_INFINITY, true);
+        for value in values {
+            let Some(value) = value else {
+                is_whole = false;
+                continue;
+            };
+            (lowest, highest) = (lowest.min(value), highest.max(value));
+        }
+        (lowest <= highest).then_some(Self { lowest, highest, is_whole })
+    }
+}
+
 /// State of a [`Sampler`] for storing.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct SamplerState {
@@ -368,12 +397,27 @@ impl Sampler {
         self.state.signals[0].good.map(|good| good.value())
     }
 
-    /// The highest fresh temperature (degrees C) and whether all sensors are fresh; `None` = no fresh sensor.
-    pub fn hottest_c(&self, now: Timestamp) -> Option<(f64, bool)> {
+    /// The fresh temperatures of the sensors (degrees C); `None` = no fresh sensor.
+    pub fn temperature_range_c(&self, now: Timestamp) -> Option<SensorRange> {
         let sensors = &self.state.signals[1..=self.sensors];
-        let fresh = sensors.iter().map(|signal| signal.fresh(now, &self.config.temperature));
-        let hottest = fresh.clone().flatten().reduce(f64::max)?;
-        Some((hottest, fresh.clone().all(|value| value.is_some())))
+        SensorRange::among(sensors.iter().map(|signal| signal.fresh(now, &self.config.temperature)))
+    }
+
+    /// Longest time that a temperature, a voltage and a current is fresh (s).
+    pub fn max_ages_s(&self) -> [f64; 3] {
+        let config = &self.config;
+        [&config.temperature, &config.voltage, &config.current].map(|limits| limits.max_age_s)
+    }
+
+    /// The fresh voltages of the cells (V), without the cells of which the voltage is `faulty`; `None` = no fresh
+    /// voltage. If only the pack's total is measured, this is the mean voltage of its cells.
+    pub fn voltage_range_v(&self, now: Timestamp, faulty: &[CellIndex]) -> Option<SensorRange> {
+        let first = 1 + self.sensors;
+        let is_faulty = |index: usize| faulty.iter().any(|cell| cell.index() == index);
+        let signals = self.state.signals[first..first + self.voltages].iter().enumerate();
+        SensorRange::among(
+            signals.map(|(index, signal)| signal.fresh(now, &self.config.voltage).filter(|_| !is_faulty(index))),
+        )
     }
 
     /// The last good value of a channel, if it is fresh.

@@ -10,8 +10,8 @@ use tokio::task::JoinSet;
 use tokio::time::timeout;
 
 use super::protocol::{Answer, Request};
-use super::{MAX_CONNECTIONS, MAX_PER_PROCESS, MAX_REQUEST_BYTES, MAX_SILENCE, MODE, daemon_path};
-use crate::io::connection_slots::{Activity, ConnectionSlots, SlotLimits};
+use super::{MAX_REQUEST_BYTES, MAX_SILENCE, MODE, SLOTS, daemon_path};
+use crate::io::connection_slots::{Activity, ConnectionSlots, LocalProcess, SlotLimits};
 use crate::io::event_log::command_words;
 use crate::io::place::PlaceSetting;
 use crate::io::unix_socket::{BoundSocket, SocketFile, bind};
@@ -76,7 +76,7 @@ struct ConnectionContext {
 }
 
 async fn accept(listener: UnixListener, context: ConnectionContext) {
-    let mut places = ConnectionSlots::new(SlotLimits { total: MAX_CONNECTIONS, per_client: MAX_PER_PROCESS });
+    let mut places = ConnectionSlots::new(SLOTS);
     let mut connections = JoinSet::new();
     loop {
         while connections.try_join_next().is_some() {}
@@ -95,21 +95,26 @@ async fn accept(listener: UnixListener, context: ConnectionContext) {
                 continue;
             }
         };
-        if !places.make_room(&peer.pid(), Instant::now()) {
+        let client = LocalProcess::from(&peer);
+        if !places.make_room(&client, Instant::now()) {
             refuse(&stream);
             continue;
         }
         let (context, activity) = (context.clone(), Activity::new());
         let of_task = activity.clone();
         let task = connections.spawn(async move { serve_connection(stream, peer, &context, &of_task).await });
-        places.take(peer.pid(), activity, task);
+        places.take(client, activity, task);
     }
 }
 
 /// Rejects a connection. The reason is sent only if sending does not block.
 fn refuse(stream: &UnixStream) {
-    tracing::warn!(limit = MAX_CONNECTIONS, "connection to the control socket rejected: too many at once");
-    let error = format!("{MAX_CONNECTIONS} connections are open, which is the limit; try again later");
+    let SlotLimits { total, per_user, per_client, .. } = SLOTS;
+    let error = format!(
+        "too many connections: at most {per_client} of one process, {per_user} of one user, {total} in total; try again \
+         later"
+    );
+    tracing::warn!(error, "connection to the control socket rejected");
     let _ = stream.try_write(&Answer::Error(error).to_line());
 }
 

@@ -151,7 +151,7 @@ impl ObservedFrames {
     }
 }
 
-/// Runs the test. `SIGINT` and `SIGTERM` end the test early; the daemon then also stops sending the alarm.
+/// Runs the test. The signals of [`Stop`] end the test early; the daemon then also stops sending the alarm.
 ///
 /// # Errors
 /// Fails if no alarm frame is configured, if an interface cannot be opened, or if the daemon does not answer or

@@ -1,4 +1,4 @@
-//! Decides who may read: everyone on this computer, or whoever knows the token.
+//! Decides who may read: every local user, or clients that know the token.
 //!
 //! | address | without a token | with a token |
 //! | --- | --- | --- |

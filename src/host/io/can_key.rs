@@ -48,8 +48,8 @@ impl CanKey {
         }
     }
 
-    /// Reads a file. `user`: the user of the daemon; he or root must own the file, which nobody else may read. `None` =
-    /// the service manager protects the file.
+    /// Reads a file. `user`: the daemon's user. This user or root must own the file, and no other user may read it.
+    /// `None` = the service manager protects the file.
     pub fn read(path: &Path, user: Option<u32>) -> Result<Self, String> {
         let error = |why: String| format!("key of [authentication]: {}: {why}", path.display());
         let unreadable = |why: std::io::Error| {

@@ -1,14 +1,16 @@
-//! Limits a server's connections, in total and per client. If a limit is reached, a new connection replaces the
-//! connection that has been idle longest, so that silent and slow clients cannot keep others out. If a client reaches
-//! its limit, the client loses one of its connections.
+//! Limits a server's connections: in total, per user and per client, with slots that only root may take. If a limit is
+//! reached, a new connection replaces the connection that has been idle longest, so that silent and slow clients cannot
+//! keep others out. If a client or a user reaches its limit, it loses one of its own connections.
 //!
 //! A connection is idle while the client has to act: to send a request, or to read the answer. A connection is never
 //! closed while its request is being processed, or within [`GRACE`] of becoming idle. If such connections take all
 //! slots, a new connection is rejected.
 
+use std::net::IpAddr;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
+use tokio::net::unix::UCred;
 use tokio::task::AbortHandle;
 
 /// Time in which a client may send its request or read its answer before another client may take the slot. A working
@@ -20,8 +22,43 @@ pub(crate) const GRACE: Duration = Duration::from_millis(250);
 pub(crate) struct SlotLimits {
     /// Maximum number of connections of all clients together.
     pub total: usize,
+    /// Slots of `total` that only root may take.
+    pub for_root: usize,
+    /// Maximum number of connections of one user.
+    pub per_user: usize,
     /// Maximum number of connections of one client.
     pub per_client: usize,
+}
+
+/// Who has opened a connection.
+pub(crate) trait Client: PartialEq {
+    /// The number of the user, if the kernel reports it.
+    fn user(&self) -> Option<u32> {
+        None
+    }
+}
+
+/// A client over TCP is an address.
+impl Client for IpAddr {}
+
+/// A client over a Unix socket is a process of a user. The connections of processes that the kernel does not identify
+/// count as one process.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct LocalProcess {
+    user: u32,
+    process: Option<i32>,
+}
+
+impl From<&UCred> for LocalProcess {
+    fn from(peer: &UCred) -> Self {
+        Self { user: peer.uid(), process: peer.pid() }
+    }
+}
+
+impl Client for LocalProcess {
+    fn user(&self) -> Option<u32> {
+        Some(self.user)
+    }
 }
 
 /// The slots; a client is identified by `K`.
@@ -67,7 +104,7 @@ impl Activity {
     }
 }
 
-impl<K: PartialEq> ConnectionSlots<K> {
+impl<K: Client> ConnectionSlots<K> {
     /// Creates slots without connections.
     pub(crate) fn new(limits: SlotLimits) -> Self {
         Self { limits, taken: Vec::new() }
@@ -76,11 +113,19 @@ impl<K: PartialEq> ConnectionSlots<K> {
     /// Makes room for a connection of `client`. Returns `false` if this is not possible.
     pub(crate) fn make_room(&mut self, client: &K, now: Instant) -> bool {
         self.taken.retain(|place| !place.task.is_finished());
-        let of_client = self.taken.iter().filter(|place| place.client == *client).count();
-        if of_client >= self.limits.per_client {
+        let SlotLimits { total, for_root, per_user, per_client } = self.limits;
+        let user = client.user();
+        let count = |is_counted: &dyn Fn(&Slot<K>) -> bool| self.taken.iter().filter(|place| is_counted(place)).count();
+        if count(&|place| place.client == *client) >= per_client {
             return self.close_idlest(now, |place| place.client == *client);
         }
-        self.taken.len() < self.limits.total || self.close_idlest(now, |_| true)
+        if user.is_some() && count(&|place| place.client.user() == user) >= per_user {
+            return self.close_idlest(now, |place| place.client.user() == user);
+        }
+        let free_to = if user == Some(0) { total } else { total - for_root };
+        // A user cannot take the slots of root.
+        let is_root = |of: Option<u32>| of == Some(0);
+        self.taken.len() < free_to || self.close_idlest(now, |place| is_root(user) || !is_root(place.client.user()))
     }
 
     /// Registers a connection after [`make_room`](Self::make_room).
@@ -100,10 +145,14 @@ impl<K: PartialEq> ConnectionSlots<K> {
 mod tests {
     use super::*;
 
+    impl Client for u32 {}
+
+    const LIMITS: SlotLimits = SlotLimits { total: 3, for_root: 0, per_user: 3, per_client: 2 };
+
     /// A connection that never ends on its own.
-    fn connect(
-        places: &mut ConnectionSlots<u32>,
-        client: u32,
+    fn connect<K: Client>(
+        places: &mut ConnectionSlots<K>,
+        client: K,
         now: Instant,
     ) -> Option<(Activity, tokio::task::JoinHandle<()>)> {
         if !places.make_room(&client, now) {
@@ -116,7 +165,7 @@ mod tests {
 
     #[tokio::test]
     async fn longest_idle_connection_is_closed_first() {
-        let mut places = ConnectionSlots::new(SlotLimits { total: 3, per_client: 2 });
+        let mut places = ConnectionSlots::new(LIMITS);
         let now = Instant::now();
         let (busy, mut busy_task) = connect(&mut places, 1, now).unwrap();
         busy.begin_request();
@@ -140,7 +189,7 @@ mod tests {
 
     #[tokio::test]
     async fn client_with_many_connections_loses_its_own() {
-        let mut places = ConnectionSlots::new(SlotLimits { total: 3, per_client: 2 });
+        let mut places = ConnectionSlots::new(LIMITS);
         let now = Instant::now();
         let (_other, mut other_task) = connect(&mut places, 1, now).unwrap();
         let (_, first) = connect(&mut places, 2, now).unwrap();
@@ -149,5 +198,33 @@ mod tests {
         let _third = connect(&mut places, 2, later).unwrap();
         assert!(first.await.unwrap_err().is_cancelled());
         assert!(tokio::time::timeout(Duration::from_millis(20), &mut other_task).await.is_err());
+    }
+
+    #[tokio::test]
+    async fn one_user_leaves_slots_for_others_and_root() {
+        let limits = SlotLimits { total: 8, for_root: 1, per_user: 5, per_client: 2 };
+        let mut places = ConnectionSlots::new(limits);
+        let now = Instant::now();
+        let of = |user, process| LocalProcess { user, process: Some(process) };
+        let mut open = Vec::new();
+        let mut try_each = |user, processes: std::ops::Range<i32>| {
+            let new: Vec<_> = processes.filter_map(|process| connect(&mut places, of(user, process), now)).collect();
+            let count = new.len();
+            open.extend(new);
+            count
+        };
+        assert_eq!(try_each(1000, 0..20), 5, "one user, one connection per process");
+        assert_eq!(try_each(1001, 20..40), 2, "another user, up to the slot for root");
+        assert_eq!(try_each(0, 40..60), 1);
+        let of_root = places.taken.last().expect("root's").task.clone();
+        for _ in 0..8 {
+            places.make_room(&of(1002, 99), now + 2 * GRACE);
+        }
+        tokio::task::yield_now().await;
+        assert!(!of_root.is_finished(), "a user does not replace root");
+        drop(open.split_off(5));
+        let mut places = ConnectionSlots::new(limits);
+        let of_root: Vec<_> = (0..9).filter_map(|_| connect(&mut places, of(0, 1), now)).collect();
+        assert_eq!(of_root.len(), 2, "one process of root");
     }
 }

@@ -18,10 +18,10 @@ use read_ahead::ReadAhead;
 /// bytes.
 const BLOCK: usize = 256 * 1024;
 
-/// Largest expansion of a compressed log. The logs of parked vehicles expand less than a hundred times, because each line
-/// has its own time. zstd stores zeros in a 30,000th of their size.
-const MAX_EXPANSION: u64 = 1000;
-/// Smaller compressed files may expand as much as a file of this size, bytes.
+/// Largest number of lines per byte of a compressed log. Logs of parked vehicles have up to 7 lines per byte, because each
+/// line has its own time; line feeds have 30,000.
+const MAX_LINES_PER_BYTE: u64 = 50;
+/// Smaller compressed files may have as many lines as a file of this size, bytes.
 const MIN_PACKED: u64 = 4096;
 
 /// One line without its line feed.
@@ -65,28 +65,28 @@ pub(super) fn open_parts(paths: &[PathBuf], read_bytes: &Arc<AtomicU64>) -> io::
     } else {
         return Ok(Box::new(whole));
     };
-    Ok(Box::new(ReadAhead::new(ExpansionLimit { decoder, packed, expanded: 0 }, BLOCK)?))
+    Ok(Box::new(ReadAhead::new(ExpansionLimit { decoder, packed, lines: 0 }, BLOCK)?))
 }
 
-/// Ends a compressed file that expands far more than a log can, because a few bytes would otherwise occupy the reader
+/// Ends a compressed file with far more lines than a log can have, because a few bytes would otherwise occupy the reader
 /// for minutes.
 struct ExpansionLimit {
     decoder: Box<dyn Read + Send>,
     /// Bytes read from the compressed file.
     packed: Arc<AtomicU64>,
-    /// Bytes that the decoder has returned.
-    expanded: u64,
+    /// Lines that the decoder has returned.
+    lines: u64,
 }
 
 impl Read for ExpansionLimit {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         let count = self.decoder.read(buffer)?;
-        self.expanded += count as u64;
+        self.lines += memchr::memchr_iter(b'\n', &buffer[..count]).count() as u64;
         let packed = self.packed.load(Ordering::Relaxed);
-        if self.expanded > MAX_EXPANSION * packed.max(MIN_PACKED) {
+        if self.lines > MAX_LINES_PER_BYTE * packed.max(MIN_PACKED) {
             let what = format!(
-                "{packed} bytes expand to more than {} bytes, must be a log: at most {MAX_EXPANSION} times",
-                self.expanded
+                "{packed} compressed bytes contain more than {} lines, must be a log of at most {MAX_LINES_PER_BYTE} lines per byte",
+                self.lines
             );
             return Err(io::Error::new(io::ErrorKind::InvalidData, what));
         }
@@ -188,8 +188,8 @@ impl Lines {
         }
     }
 
-    /// Returns the first bytes and does not consume them: at least `len` (at most 256 KiB) bytes, or the whole source if
-    /// it is shorter. Must be called before any line is consumed.
+    /// Returns the first bytes and does not consume them: at least `len` (at most 256 KiB) bytes, or the whole source
+    /// if it is shorter. Must be called before any line is consumed.
     ///
     /// # Errors
     /// Returns the errors of the source.

@@ -18,6 +18,7 @@ pub mod reading;
 pub mod record;
 pub mod result_file;
 mod row_limit;
+pub mod runtime;
 pub mod segments;
 pub mod snapshot_file;
 pub mod socket;

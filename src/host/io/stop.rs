@@ -1,4 +1,4 @@
-//! Ends the daemon's loop on a signal that would end the process, or after a set time.
+//! Waits for a signal that would end the process, so that a program can stop cleanly, or for a set time.
 
 use std::future::poll_fn;
 use std::io;
@@ -10,8 +10,8 @@ use tokio::sync::oneshot;
 use tokio::time::{Instant, sleep_until};
 
 /// Numbers of further signals that end a process by default, except those of crashes: SIGQUIT, SIGUSR1, SIGUSR2,
-/// SIGALRM, SIGSTKFLT, SIGXCPU, SIGVTALRM, SIGPROF, SIGIO, SIGPWR (Linux, except MIPS) and the signals for applications.
-/// The C library may use the first of the latter itself; these cannot be caught.
+/// SIGALRM, SIGSTKFLT, SIGXCPU, SIGVTALRM, SIGPROF, SIGIO, SIGPWR (Linux, except MIPS) and the signals for
+/// applications. The C library reserves the first real-time signals; catching those fails and is skipped.
 const OTHERS: [std::ops::RangeInclusive<i32>; 9] =
     [3..=3, 10..=10, 12..=12, 14..=14, 16..=16, 24..=24, 26..=27, 29..=30, 34..=64];
 /// SIGXFSZ. The write that exceeded the limit then fails like any other write, and the daemon goes on.
@@ -33,7 +33,7 @@ impl Stop {
         signals.extend(others.filter_map(|number| catch(SignalKind::from_raw(number)).ok()));
         let _ = signal(SignalKind::from_raw(FILE_SIZE));
         let (sender, signalled) = oneshot::channel();
-        // A task of its own: the loop then checks one receiver per round, not one per signal.
+        // A separate task waits for all signals, so the caller polls one receiver instead of about 40.
         tokio::spawn(async move { sender.send(first(signals).await) });
         Ok(Self { signalled, at: duration.map(|duration| Instant::now() + duration) })
     }

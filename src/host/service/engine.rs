@@ -177,7 +177,7 @@ impl Engine {
         for event in &self.outputs.events {
             self.log.log(event);
             self.readiness.note(event);
-            self.recent.note(event);
+            self.recent.note(Instant::now().into_std(), event);
             self.has_lost_file |= write_or_stop(&mut self.events, "events", |file| event_log::write_line(file, event));
         }
         ticket
@@ -265,6 +265,22 @@ impl Engine {
         {
             store.write_start(&self.monitor, time);
         }
+    }
+
+    /// Queues a checkpoint.
+    #[cfg(test)]
+    pub(super) fn write_checkpoint(&mut self, time: Timestamp) {
+        if let Some(store) = &mut self.store {
+            store.write_start(&self.monitor, time);
+        }
+    }
+
+    /// Waits until everything queued is on disk, and handles the result.
+    #[cfg(test)]
+    pub(super) fn settle_store(&mut self, time: Timestamp) -> Option<StoreProgress> {
+        let progress = self.store.as_ref()?.settle();
+        self.handle_store_progress(progress, time);
+        Some(progress)
     }
 
     /// Writes the last state to disk.

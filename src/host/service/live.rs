@@ -27,13 +27,13 @@ use crate::store::StoreProgress;
 /// Maximum number of records handled between two checks of the timer. A full bus delivers fewer records during one
 /// tick.
 const BATCH: usize = 256;
-/// If the loop has not run for longer than this time, its process was stopped (SIGSTOP, a debugger, a computer without
-/// time for it). The sockets then hold frames of a long time, which must be merged before they are handled. The time is
-/// the largest step back that the core accepts from frames merged out of order.
+/// If the loop has not run for longer than this time, its process was stopped (by SIGSTOP or a debugger), or the
+/// computer was overloaded. The sockets then hold frames of a long time, which must be merged before they are handled.
+/// The time is the largest step back that the core accepts from frames merged out of order.
 const MAX_PAUSE_NS: i64 = MERGE_TOLERANCE_NS;
-/// Pause between two attempts to collect these frames, and maximum number of attempts. Nothing is collected after an attempt
-/// that found only frames received after the stop.
+/// Pause between two attempts to collect these frames.
 const MERGE_ROUND: Duration = Duration::from_millis(10);
+/// Maximum number of attempts. Collecting ends with the first attempt that finds no frame from the time of the stop.
 const MERGE_ROUNDS: usize = 100;
 /// Maximum number of records that are merged after a stop. All sockets together hold fewer.
 const MAX_MERGED: usize = 1 << 20;
@@ -51,7 +51,7 @@ pub(super) struct ServiceLoop {
     pub(super) clock: MappedClock,
     pub(super) clock_steps: StepDetector,
     pub(super) batch: Vec<Record>,
-    /// Time of the latest tick.
+    /// When the loop last ran.
     pub(super) ticked: Timestamp,
     pub(super) left_out_reported: Instant,
     pub(super) status_publisher: StatusPublisher,
@@ -157,7 +157,6 @@ impl ServiceLoop {
 
     /// Handles the input that was received before the tick, then the tick. Returns the time of the tick.
     async fn tick(&mut self) -> Timestamp {
-        self.merge_after_stop().await;
         self.drain().await;
         let time = self.clock.now();
         self.ticked = time;
@@ -225,6 +224,7 @@ impl ServiceLoop {
         for _ in 0..INBOX / BATCH {
             // The tasks of the interfaces read from and write to their sockets here.
             tokio::task::yield_now().await;
+            self.merge_after_stop().await;
             while self.batch.len() < BATCH
                 && let Ok(received) = self.inbox.try_recv()
             {

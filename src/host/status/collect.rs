@@ -2,6 +2,7 @@
 //! values and serialise nothing.
 
 use std::collections::VecDeque;
+use std::time::Instant;
 
 use super::MAX_SILENCE;
 use super::counters::{ClientCounts, Latency, ServiceCounters};
@@ -30,13 +31,14 @@ const MAX_BURST: usize = 1024;
 /// are left out, because they would displace all other events.
 #[derive(Debug, Default)]
 pub struct RecentEvents {
-    latest: VecDeque<Event>,
+    /// Each event with the time at which it was noted. An event itself may be older.
+    latest: VecDeque<(Instant, Event)>,
     count: u64,
 }
 
 impl RecentEvents {
     /// Adds an event.
-    pub fn note(&mut self, event: &Event) {
+    pub fn note(&mut self, now: Instant, event: &Event) {
         if matches!(event.kind, EventKind::HalfCycle { .. } | EventKind::Capacity { .. } | EventKind::LossModes { .. })
         {
             return;
@@ -44,16 +46,16 @@ impl RecentEvents {
         if self.latest.len() == MAX_BURST {
             self.latest.pop_front();
         }
-        self.latest.push_back(*event);
+        self.latest.push_back((now, *event));
         self.count += 1;
     }
 
     /// The events to list at `now`: the latest [`MAX_EVENTS`], and all events of the last [`MAX_SILENCE`], so that a
     /// reader that misses a few documents still receives each event.
-    fn listed(&self, now: Timestamp) -> Vec<Event> {
-        let older = self.latest.iter().take_while(|event| now.since(event.time) > MAX_SILENCE.as_secs_f64()).count();
+    fn listed(&self, now: Instant) -> Vec<Event> {
+        let older = self.latest.iter().take_while(|(noted, _)| now.duration_since(*noted) > MAX_SILENCE).count();
         let skipped = older.min(self.latest.len().saturating_sub(MAX_EVENTS));
-        self.latest.iter().skip(skipped).copied().collect()
+        self.latest.iter().skip(skipped).map(|(_, event)| *event).collect()
     }
 }
 
@@ -117,7 +119,7 @@ pub struct Sources<'a> {
 impl Sources<'_> {
     /// Collects the document, which is serialised later.
     pub fn draft(self, now: Timestamp) -> Draft {
-        let events = self.events.listed(now);
+        let events = self.events.listed(Instant::now());
         Draft { document: self.document(now), events }
     }
 
@@ -264,16 +266,21 @@ fn alarms(monitor: &Monitor) -> AlarmStatus {
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
     use super::*;
 
     #[test]
     fn burst_is_listed_until_every_reader_had_time() {
-        let mut recent = RecentEvents::default();
-        for second in [0.0, 100.0] {
-            let time = Timestamp::from_secs(second);
-            (0..1000).for_each(|_| recent.note(&Event { time, kind: EventKind::Gap { seconds: None } }));
+        let (mut recent, start) = (RecentEvents::default(), Instant::now());
+        let event = Event { time: Timestamp::ZERO, kind: EventKind::Gap { seconds: None } };
+        let after = |seconds: u64| start + Duration::from_secs(seconds);
+        for seconds in [0, 100] {
+            (0..1000).for_each(|_| recent.note(after(seconds), &event));
         }
-        let listed = |second: f64| recent.listed(Timestamp::from_secs(second)).len();
-        assert_eq!((recent.count, listed(101.0), listed(106.0)), (2000, 1000, 32));
+        let listed = |seconds: u64| recent.listed(after(seconds)).len();
+        assert_eq!((recent.count, listed(101), listed(106)), (2000, 1000, 32));
+        (0..MAX_BURST).for_each(|_| recent.note(after(107), &event));
+        assert_eq!(recent.listed(after(107)).len(), MAX_BURST, "the burst before is dropped");
     }
 }

@@ -11,7 +11,7 @@ use crate::status::document::StatusDocument;
 /// Units by suffix of the key.
 const UNITS: [(&str, &str); 7] =
     [("_per_s", " per s"), ("_ah", " Ah"), ("_a", " A"), ("_v", " V"), ("_s", " s"), ("_c", " °C"), ("seconds", " s")];
-/// What happened, for events of which a key with two states says more than the name.
+/// Events whose text depends on a boolean key: name, key, text if true, text if false.
 const STATES: [(&str, &str, &str, &str); 9] = [
     ("bus_asleep", "asleep", "buses asleep", "buses awake"),
     ("flood", "active", "frame rate too high, dropping frames", "frame rate normal again"),
@@ -23,7 +23,7 @@ const STATES: [(&str, &str, &str, &str); 9] = [
     ("test", "running", "alarm test started", "alarm test ended"),
     ("trust", "trusted", "estimate trusted again", "estimate untrusted"),
 ];
-/// Keys of an alarm that are shown; its rule and its change are the name.
+/// Keys shown for an alarm. The text before the colon is its rule and its change.
 const OF_ALARM: [&str; 4] = ["cell", "severity", "threshold", "value"];
 /// Keys whose numbers are hexadecimal.
 const HEXADECIMAL: [&str; 6] = ["against", "class", "code", "identifier", "service", "to"];

@@ -297,7 +297,7 @@ const fn metric_unit(unit: Unit) -> (&'static str, f64) {
         Unit::Watts => ("watts", 1.0),
         Unit::Seconds => ("seconds", 1.0),
         Unit::Days => ("seconds", 86_400.0),
-        Unit::Cycles => ("", 1.0),
+        Unit::Cycles | Unit::Count => ("", 1.0),
     }
 }
 

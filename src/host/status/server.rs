@@ -10,14 +10,17 @@ use std::time::Duration;
 
 use tokio::io::AsyncWriteExt;
 use tokio::net::UnixStream;
+use tokio::net::unix::SocketAddr;
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
 use tokio::time::{Instant, timeout};
 
 use super::counters::ClientCounts;
 use super::document::StatusDocument;
-use super::{MAX_CLIENTS, MAX_SILENCE, MODE, STALE, daemon_path, stream_path};
+use super::{MAX_SILENCE, MODE, SLOTS, STALE, daemon_path, stream_path};
+use crate::io::connection_slots::{Activity, ConnectionSlots, LocalProcess, SlotLimits};
 use crate::io::place::PlaceSetting;
+use crate::io::runtime::new_runtime;
 use crate::io::unix_socket::{BindError, BoundSocket, bind};
 use crate::monitor::Event;
 
@@ -146,7 +149,7 @@ fn run(
     drafts: mpsc::Receiver<Box<Draft>>,
     ready: &SyncSender<Result<(), BindError>>,
 ) {
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
+    let runtime = new_runtime();
     let served = runtime.map_err(BindError::Io).and_then(|runtime| {
         runtime.block_on(async {
             let once = bind(&path, MODE).await?;
@@ -164,8 +167,8 @@ fn run(
 /// Serves until the daemon's loop closes the channel of drafts.
 async fn serve([once, stream]: [BoundSocket; 2], context: &ClientContext, mut drafts: mpsc::Receiver<Box<Draft>>) {
     let (published, latest) = watch::channel(None);
-    let mut clients = JoinSet::new();
-    let mut refusals = RefusalLog::default();
+    let mut clients =
+        Clients { tasks: JoinSet::new(), slots: ConnectionSlots::new(SLOTS), refusals: RefusalLog::default() };
     loop {
         tokio::select! {
             biased;
@@ -173,19 +176,15 @@ async fn serve([once, stream]: [BoundSocket; 2], context: &ClientContext, mut dr
                 Some(draft) => publish(*draft, &published),
                 None => return,
             },
-            Some(_) = clients.join_next() => {}
+            Some(_) = clients.tasks.join_next() => {}
             accepted = once.listener.accept() => {
-                if let Some(client) = admit(accepted.map(|(client, _)| client), clients.len(), context, &mut refusals).await {
-                    clients.spawn(serve_once(client, context.clone(), latest.clone()));
-                }
+                clients.admit(accepted, context, |client| serve_once(client, context.clone(), latest.clone())).await;
             }
             accepted = stream.listener.accept() => {
-                if let Some(client) = admit(accepted.map(|(client, _)| client), clients.len(), context, &mut refusals).await {
-                    clients.spawn(serve_stream(client, context.clone(), latest.clone()));
-                }
+                clients.admit(accepted, context, |client| serve_stream(client, context.clone(), latest.clone())).await;
             }
         }
-        context.count(|counts| counts.connected = clients.len() as u64);
+        context.count(|counts| counts.connected = clients.tasks.len() as u64);
     }
 }
 
@@ -207,33 +206,51 @@ impl RefusalLog {
     fn note(&mut self) {
         self.unreported += 1;
         if self.reported.is_none_or(|reported| reported.elapsed() >= REFUSAL_LOG_PERIOD) {
-            tracing::warn!(clients = self.unreported, limit = MAX_CLIENTS, "status clients rejected: too many at once");
+            let SlotLimits { total, per_user, per_client, .. } = SLOTS;
+            tracing::warn!(
+                clients = self.unreported,
+                per_client,
+                per_user,
+                total,
+                "status clients rejected: too many at once"
+            );
             (self.unreported, self.reported) = (0, Some(Instant::now()));
         }
     }
 }
 
-/// Admits a client if there is room.
-async fn admit(
-    accepted: io::Result<UnixStream>,
-    connected: usize,
-    context: &ClientContext,
-    refusals: &mut RefusalLog,
-) -> Option<UnixStream> {
-    match accepted {
-        Err(error) => {
-            tracing::warn!(%error, "connection to the status socket not accepted");
-            tokio::time::sleep(ACCEPT_PAUSE).await;
-            None
-        }
-        Ok(_) if connected >= MAX_CLIENTS => {
-            context.count(|counts| counts.refused += 1);
-            refusals.note();
-            None
-        }
-        Ok(client) => {
-            context.count(|counts| counts.served += 1);
-            Some(client)
+/// The connected clients.
+struct Clients {
+    tasks: JoinSet<()>,
+    slots: ConnectionSlots<LocalProcess>,
+    refusals: RefusalLog,
+}
+
+impl Clients {
+    /// Serves a client if there is room.
+    async fn admit<S: Future<Output = ()> + Send + 'static>(
+        &mut self,
+        accepted: io::Result<(UnixStream, SocketAddr)>,
+        context: &ClientContext,
+        serve: impl FnOnce(UnixStream) -> S,
+    ) {
+        let identified = accepted.and_then(|(stream, _)| Ok((LocalProcess::from(&stream.peer_cred()?), stream)));
+        match identified {
+            Err(error) => {
+                tracing::warn!(%error, "connection to the status socket not accepted");
+                tokio::time::sleep(ACCEPT_PAUSE).await;
+            }
+            Ok((client, stream)) if self.slots.make_room(&client, std::time::Instant::now()) => {
+                context.count(|counts| counts.served += 1);
+                // A reader is never idle: it waits for the next document.
+                let activity = Activity::new();
+                activity.begin_request();
+                self.slots.take(client, activity, self.tasks.spawn(serve(stream)));
+            }
+            Ok(_) => {
+                context.count(|counts| counts.refused += 1);
+                self.refusals.note();
+            }
         }
     }
 }

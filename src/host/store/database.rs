@@ -42,7 +42,7 @@ use crate::monitor::{EventKind, LearnedCell};
 use crate::quantity::Timestamp;
 
 /// The format that this program reads and writes.
-pub(super) const FORMAT: i32 = 1;
+pub(super) const FORMAT: i32 = 2;
 /// Longest wait of a commit for a reader that has locked the database.
 const BUSY_TIMEOUT: Duration = Duration::from_millis(100);
 /// Longest check of the file at the start. Damage in the part that was not checked is found when that part is read.
@@ -306,8 +306,10 @@ fn create(connection: &mut Connection) -> rusqlite::Result<()> {
     for table in HistoryTable::ALL {
         let columns: String =
             table.columns().iter().map(|column| format!(", {column} {}", HistoryTable::sql_type(column))).collect();
-        let sql =
-            format!("CREATE TABLE {} (seq INTEGER PRIMARY KEY, moment INTEGER NOT NULL{columns}) STRICT", table.name());
+        let sql = format!(
+            "CREATE TABLE {} (seq INTEGER PRIMARY KEY, code INTEGER NOT NULL, moment INTEGER NOT NULL{columns}) STRICT",
+            table.name()
+        );
         transaction.execute(&sql, [])?;
     }
     // The bytes "pkwt" identify the file for file(1).

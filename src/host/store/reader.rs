@@ -1,5 +1,7 @@
 //! Reads a store without changing it. This works next to a running daemon, after a crash, and on a read-only disk.
 
+use std::cell::RefCell;
+use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -9,7 +11,7 @@ use rusqlite::{Connection, OpenFlags};
 use super::database;
 use super::folder::DATABASE;
 use super::rows::{HistoryRow, HistoryTable};
-use super::segments::{self, ChainReport, NotedHead, hex};
+use super::segments::{self, ChainReport, NotedHead, StoredRow, hex};
 use super::state_files::{FILES, FoundStates, StateDocument, StateFiles};
 use crate::config::VehicleIdentity;
 use crate::io::place::with_suffix;
@@ -24,6 +26,8 @@ const MAX_COPY_BYTES: u64 = 256 << 20;
 pub struct HistoryReader {
     connection: Connection,
     path: PathBuf,
+    /// Numbers of the damaged rows that were read. Such rows are left out.
+    damaged: RefCell<BTreeSet<i64>>,
     /// Folder of the copy, if the original cannot be read in place.
     _copy: Option<TemporaryCopy>,
 }
@@ -96,7 +100,7 @@ impl HistoryReader {
         }
         let (connection, copy) = open_read_only(&path, MAX_COPY_BYTES).map_err(named)?;
         match database::format(&connection) {
-            Ok(database::FORMAT) => Ok(Self { connection, path, _copy: copy }),
+            Ok(database::FORMAT) => Ok(Self { connection, path, damaged: RefCell::default(), _copy: copy }),
             Ok(format) => Err(named(format!("format {format}, must be {}", database::FORMAT))),
             Err(error) => Err(named(error.to_string())),
         }
@@ -148,6 +152,14 @@ impl HistoryReader {
     /// Fails if the file cannot be read.
     pub fn contradiction(&self, noted: &NotedHead) -> Result<Option<String>, String> {
         self.at_once(|connection| segments::contradiction(connection, noted))
+    }
+
+    /// Describes the damaged rows among the rows that were read, as a sentence without its full stop; `None` = all rows
+    /// were intact.
+    pub fn damage(&self) -> Option<String> {
+        let damaged = self.damaged.borrow();
+        let first = damaged.first()?;
+        Some(format!("damaged rows left out of the history: {}, the first is row {first}", damaged.len()))
     }
 
     /// Runs all queries of `read` on one snapshot of the file, even while a daemon writes.
@@ -231,26 +243,30 @@ impl HistoryReader {
         order: &str,
         take: &mut dyn FnMut(HistoryEntry),
     ) -> rusqlite::Result<()> {
+        // A row without a readable time is read, too: it is damaged.
         let sql = format!(
-            "SELECT r.seq, m.wall_ns, m.time_ns, m.boot, m.pack, r.{} FROM {} r JOIN moment m ON m.id = r.moment WHERE (?1 IS \
-             NULL OR r.cell = ?1) AND (?2 IS NULL OR m.wall_ns >= ?2) AND (?3 IS NULL OR m.wall_ns <= ?3) ORDER BY r.seq {order} \
-             LIMIT ?4",
-            kind.columns().join(", r."),
-            kind.name()
+            "{} WHERE (?1 IS NULL OR r.cell = ?1) AND coalesce(m.wall_ns >= ?2, TRUE) AND coalesce(m.wall_ns <= ?3, TRUE) ORDER \
+             BY r.seq {order} LIMIT ?4",
+            StoredRow::select(kind)
         );
         let limit = filter.limit.map_or(-1, i64::from);
         let mut statement = self.connection.prepare(&sql)?;
         let mut rows = statement.query((filter.cell, filter.since_ns, filter.until_ns, limit))?;
         while let Some(row) = rows.next()? {
-            let boot: Vec<u8> = row.get(3)?;
+            let stored = StoredRow::read(kind, row)?;
+            if !stored.is_intact() {
+                self.damaged.borrow_mut().insert(stored.seq);
+                continue;
+            }
+            let boot: Vec<u8> = row.get(5)?;
             take(HistoryEntry {
                 kind,
-                seq: row.get(0)?,
-                wall_ns: row.get(1)?,
-                time_ns: row.get(2)?,
+                seq: stored.seq,
+                wall_ns: row.get(3)?,
+                time_ns: row.get(4)?,
                 boot: hex(&boot),
-                pack: row.get(4)?,
-                values: (5..5 + kind.columns().len())
+                pack: row.get(6)?,
+                values: (StoredRow::COLUMNS..StoredRow::COLUMNS + kind.columns().len())
                     .map(|index| row.get(index).map(json))
                     .collect::<rusqlite::Result<_>>()?,
             });

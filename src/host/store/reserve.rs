@@ -6,8 +6,11 @@
 
 use std::fs::{self, File};
 use std::io::{self, Write};
+use std::os::unix::fs::OpenOptionsExt as _;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
+
+use nix::libc::{O_NOFOLLOW, O_NONBLOCK};
 
 /// Name of the file in the state folder.
 const FILE_NAME: &str = "packwatch.reserve";
@@ -33,7 +36,7 @@ pub(super) struct Reserve {
 impl Reserve {
     /// The reserve of a folder, which may not exist yet.
     pub(super) fn new(folder: &Path) -> Self {
-        let found = fs::metadata(folder.join(FILE_NAME)).map_or(0, |file| file.len());
+        let found = open(&folder.join(FILE_NAME)).and_then(|file| file.metadata()).map_or(0, |file| file.len());
         let left = usize::try_from(found).unwrap_or(BYTES).min(BYTES);
         Self { folder: folder.to_owned(), left, tried: None }
     }
@@ -63,7 +66,14 @@ impl Reserve {
             return;
         }
         let path = self.folder.join(FILE_NAME);
-        let grown = File::options().create(true).append(true).open(&path).and_then(|file| {
+        if fs::symlink_metadata(&path).is_ok_and(|found| !found.is_file()) {
+            // Something else has the name.
+            let _ = fs::remove_file(&path);
+        }
+        let is_missing = !path.exists();
+        let opened = if is_missing { File::create_new(&path) } else { open(&path) };
+        self.left = if is_missing { 0 } else { self.left };
+        let grown = opened.and_then(|file| {
             let grown = write(&file, BYTES - self.left);
             // A partly extended file would only take room from other files.
             let kept = grown.as_ref().map_or(Some(self.left), |()| None);
@@ -85,7 +95,8 @@ impl Reserve {
     /// Tries to write one step to the probe file.
     fn is_disk_full(&self) -> bool {
         let path = self.folder.join(PROBE_NAME);
-        let written = File::create(&path).and_then(|file| write(&file, STEP_BYTES));
+        let _ = fs::remove_file(&path);
+        let written = File::create_new(&path).and_then(|file| write(&file, STEP_BYTES));
         let _ = fs::remove_file(&path);
         written.is_err_and(|error| matches!(error.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded))
     }
@@ -96,13 +107,20 @@ impl Reserve {
         let path = self.folder.join(FILE_NAME);
         // The file is synced, because the space can be given to another file only after the change is in the file
         // system's journal.
-        let freed = File::options().write(true).open(&path).and_then(|file| {
+        let freed = open(&path).and_then(|file| {
             file.set_len(self.left as u64)?;
             file.sync_all()
         });
         tracing::warn!(file = %path.display(), freed = freed.is_ok(), left = self.left, "disk full: using the reserve");
         freed.is_ok()
     }
+}
+
+/// Opens the reserve. Fails if it is a symbolic link, which may lead to a file of another program, or no regular file.
+fn open(path: &Path) -> io::Result<File> {
+    let file = File::options().append(true).custom_flags(O_NOFOLLOW | O_NONBLOCK).open(path)?;
+    let is_file = file.metadata()?.is_file();
+    is_file.then_some(file).ok_or_else(|| io::Error::other("not a regular file"))
 }
 
 /// Writes bytes that are not all zero. A file system could store zeros as a hole, which takes no space.
@@ -136,5 +154,20 @@ mod tests {
         assert!(reserve.is_whole() && length() == 1 << 20);
         (0..8).for_each(|_| assert!(reserve.release()));
         assert!(!reserve.is_usable() && length() == 0);
+    }
+
+    #[test]
+    fn reserve_and_probe_leave_linked_files_alone() {
+        let folder = tempfile::tempdir().unwrap();
+        let other = folder.path().join("other");
+        fs::write(&other, "of another program").unwrap();
+        for name in [FILE_NAME, PROBE_NAME] {
+            std::os::unix::fs::symlink(&other, folder.path().join(name)).unwrap();
+        }
+        let mut reserve = Reserve::new(folder.path());
+        assert!(!reserve.is_usable());
+        reserve.make();
+        assert!(reserve.is_whole() && !reserve.is_disk_full() && reserve.release());
+        assert_eq!(fs::read(&other).unwrap(), b"of another program");
     }
 }

@@ -1,8 +1,9 @@
 //! Divides the history into segments, chains the rows by hash, and verifies the chain. A segment contains the rows of a
 //! day, but at most about 10,000 rows.
 //!
-//! Every row has a number, counted across the tables. The hash of a segment is a SHA-256 chain over its rows, which
-//! starts from the hash of the segment before. The hash reveals rows that were changed, removed, inserted or moved. The
+//! Every row has a number, counted across the tables, and a check code: the first eight bytes of its SHA-256 hash. The
+//! code reveals a changed row when it is read. The hash of a segment is a chain over its rows, which starts from the
+//! hash of the segment before. The chain reveals rows that were changed, removed, inserted or moved. The
 //! number of segments is stored separately; this number reveals missing segments at the end. The oldest segments are
 //! deleted as a whole but keep their hashes, so the remaining segments can still be verified. A person who can write
 //! the file can recompute the whole chain. A copy of the chain's end that is kept elsewhere reveals a recomputed chain
@@ -12,12 +13,13 @@ use std::collections::BTreeMap;
 use std::fmt;
 use std::str::FromStr;
 
-use rusqlite::types::Value;
+use rusqlite::types::{Value, ValueRef};
 use rusqlite::{Connection, OptionalExtension, Row, params};
 use serde::Serialize;
 use sha2::{Digest, Sha256};
 
 use super::backlog;
+use super::database::is_damage;
 use super::rows::HistoryTable;
 use super::stamp::{BootId, SANE_WALL_NS, Stamp};
 
@@ -105,13 +107,18 @@ impl Segment {
         values: &[Value],
     ) -> rusqlite::Result<()> {
         self.last = self.last.saturating_add(1);
-        self.hash = link(&self.hash, table, self.last, moment.iter().chain(values));
+        let hash = row_hash(table, self.last, moment.iter().chain(values).map(ValueRef::from));
+        let code = check_code(&hash);
+        self.hash = link(&self.hash, &hash, code);
         self.half_cycles = self.half_cycles.saturating_add((table == HistoryTable::HalfCycle).into());
         let places: String = (0..values.len()).map(|_| ", ?").collect();
-        let sql =
-            format!("INSERT INTO {} (seq, moment, {}) VALUES (?, ?{places})", table.name(), table.columns().join(", "));
-        let seq = Value::Integer(self.last);
-        let bound = std::iter::once(&seq).chain(moment.first()).chain(values);
+        let sql = format!(
+            "INSERT INTO {} (seq, code, moment, {}) VALUES (?, ?, ?{places})",
+            table.name(),
+            table.columns().join(", ")
+        );
+        let own = [Value::Integer(self.last), Value::Integer(code)];
+        let bound = own.iter().chain(moment.first()).chain(values);
         connection.prepare_cached(&sql)?.execute(rusqlite::params_from_iter(bound)).map(drop)
     }
 
@@ -126,52 +133,89 @@ impl Segment {
 
     /// Computes the hash of row `last` from the stored rows.
     fn hash_to(&self, connection: &Connection, before: &Hash, last: i64) -> rusqlite::Result<Hash> {
-        let mut rows: BTreeMap<(i64, HistoryTable), Vec<Value>> = BTreeMap::new();
+        let mut rows: BTreeMap<(i64, HistoryTable), (Hash, i64)> = BTreeMap::new();
         // The number is bounded, so that a damaged number does not fill the memory.
         let last = last.min(self.first.saturating_add(MAX_ROWS + backlog::MAX_ROWS as i64));
         for table in HistoryTable::ALL {
-            let sql = format!(
-                "SELECT r.seq, m.id, m.wall_ns, m.time_ns, m.boot, m.pack, r.{} FROM {} r LEFT JOIN moment m ON m.id = \
-                 r.moment WHERE r.seq BETWEEN ?1 AND ?2",
-                table.columns().join(", r."),
-                table.name()
-            );
+            let sql = format!("{} WHERE r.seq BETWEEN ?1 AND ?2", StoredRow::select(table));
             let mut statement = connection.prepare_cached(&sql)?;
-            let columns = 6 + table.columns().len();
             let mut found = statement.query([self.first, last])?;
             while let Some(row) = found.next()? {
-                let values = (1..columns).map(|index| row.get(index)).collect::<rusqlite::Result<_>>()?;
-                rows.insert((row.get(0)?, table), values);
+                let StoredRow { seq, hash, code } = StoredRow::read(table, row)?;
+                rows.insert((seq, table), (hash, code));
             }
         }
-        Ok(rows.iter().fold(*before, |hash, ((seq, table), values)| link(&hash, *table, *seq, values)))
+        Ok(rows.values().fold(*before, |chain, (hash, code)| link(&chain, hash, *code)))
     }
 }
 
-/// Computes the hash of a row from the hash of the row before, the table, the number, and every value with its type and
-/// length.
-fn link<'v>(before: &Hash, table: HistoryTable, seq: i64, values: impl IntoIterator<Item = &'v Value>) -> Hash {
+/// What a row's check and the chain need.
+pub(super) struct StoredRow {
+    pub seq: i64,
+    hash: Hash,
+    code: i64,
+}
+
+impl StoredRow {
+    /// Number of columns of [`StoredRow::select`] before the table's own columns.
+    pub(super) const COLUMNS: usize = 7;
+
+    /// Selects number, check code, moment (number, wall clock, clock of the inputs, boot, pack) and the table's columns.
+    pub(super) fn select(table: HistoryTable) -> String {
+        format!(
+            "SELECT r.seq, r.code, m.id, m.wall_ns, m.time_ns, m.boot, m.pack, r.{} FROM {} r LEFT JOIN moment m ON m.id = r.moment",
+            table.columns().join(", r."),
+            table.name()
+        )
+    }
+
+    /// Computes the hash of a selected row. A value of a wrong type changes the hash and is no error.
+    pub(super) fn read(table: HistoryTable, row: &Row<'_>) -> rusqlite::Result<Self> {
+        let seq = row.get(0)?;
+        let values = (2..Self::COLUMNS + table.columns().len()).map(|index| row.get_ref(index));
+        let hash = row_hash(table, seq, values.collect::<rusqlite::Result<Vec<_>>>()?);
+        Ok(Self { seq, hash, code: row.get_ref(1)?.as_i64().unwrap_or(0) })
+    }
+
+    /// Whether the row is as it was written.
+    pub(super) fn is_intact(&self) -> bool {
+        self.code == check_code(&self.hash)
+    }
+}
+
+/// Computes the hash of a row from the table, the number, and every value with its type and length.
+fn row_hash<'v>(table: HistoryTable, seq: i64, values: impl IntoIterator<Item = ValueRef<'v>>) -> Hash {
     let mut hasher = Sha256::new();
-    hasher.update(before);
     hasher.update(table.name().as_bytes());
     hasher.update([0]);
     hasher.update(seq.to_le_bytes());
     for value in values {
         match value {
-            Value::Null => hasher.update([0]),
-            Value::Integer(whole) => {
+            ValueRef::Null => hasher.update([0]),
+            ValueRef::Integer(whole) => {
                 hasher.update([1]);
                 hasher.update(whole.to_le_bytes());
             }
-            Value::Real(real) => {
+            ValueRef::Real(real) => {
                 hasher.update([2]);
                 hasher.update(real.to_bits().to_le_bytes());
             }
-            Value::Text(text) => update_bytes(&mut hasher, 3, text.as_bytes()),
-            Value::Blob(blob) => update_bytes(&mut hasher, 4, blob),
+            ValueRef::Text(text) => update_bytes(&mut hasher, 3, text),
+            ValueRef::Blob(blob) => update_bytes(&mut hasher, 4, blob),
         }
     }
     hasher.finalize().into()
+}
+
+/// The check code of a row: the first eight bytes of its hash.
+fn check_code(hash: &Hash) -> i64 {
+    let [a, b, c, d, e, f, g, h, ..] = *hash;
+    i64::from_le_bytes([a, b, c, d, e, f, g, h])
+}
+
+/// Appends a row to the chain. The stored code is part of the chain, so a changed code breaks it.
+fn link(before: &Hash, row: &Hash, code: i64) -> Hash {
+    Sha256::new().chain_update(before).chain_update(row).chain_update(code.to_le_bytes()).finalize().into()
 }
 
 fn update_bytes(hasher: &mut Sha256, tag: u8, bytes: &[u8]) {
@@ -190,7 +234,10 @@ fn pairs(connection: &Connection) -> rusqlite::Result<Vec<(Segment, Segment)>> {
     let (mut before, mut pairs) = (Segment::START, Vec::new());
     let mut statement = connection.prepare(&format!("SELECT {COLUMNS} FROM segment ORDER BY id"))?;
     for segment in statement.query_map([], Segment::of_row)? {
-        let segment = segment?;
+        // A segment with a value of a wrong type breaks the chain.
+        let next = before.last.saturating_add(1);
+        let damaged = Segment { id: before.id.saturating_add(1), first: next, last: next, ..Segment::START };
+        let segment = segment.or_else(|error| if is_damage(&error) { Ok(damaged) } else { Err(error) })?;
         pairs.push((before, segment));
         before = segment;
     }
@@ -265,7 +312,8 @@ impl fmt::Display for BrokenSegment {
 
 /// Verifies the chain, segment by segment.
 pub(super) fn verify(connection: &Connection) -> rusqlite::Result<ChainReport> {
-    let noted: i64 = connection.query_row("SELECT segments FROM meta", [], |row| row.get(0))?;
+    let noted =
+        connection.query_row("SELECT segments FROM meta", [], |row| Ok(row.get_ref(0)?.as_i64().unwrap_or(-1)))?;
     let mut report = ChainReport { good_rows: 0, rows: 0, deleted_rows: 0, head: String::new(), broken: None };
     let mut newest = Segment::START;
     for (before, segment) in pairs(connection)? {

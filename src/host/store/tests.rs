@@ -328,6 +328,8 @@ fn deleted_or_replaced_store_is_reported_and_written_again() {
         assert_eq!(reader.state().unwrap().snapshot.time, Timestamp::from_secs(3.0), "{number}");
         let entries = reader.entries(&HistoryQuery::default()).unwrap();
         assert!(entries.iter().any(|entry| entry.kind == HistoryTable::Capacity), "{number}: {entries:?}");
+        let told = entries.iter().filter(|entry| entry.values.contains(&"replaced".into()));
+        assert_eq!(told.count(), 1, "{number}: {entries:?}");
     }
 }
 

@@ -124,6 +124,12 @@ impl WriteQueue {
         self.wake.notify_one();
     }
 
+    /// Ticket of the last submission.
+    #[cfg(test)]
+    pub(super) fn submitted(&self) -> u64 {
+        self.lock().ticket
+    }
+
     /// Number of rows that were dropped for lack of room and are not yet reported in the history.
     pub(super) fn lost_rows(&self) -> u64 {
         self.lock().backlog.lost()
@@ -176,7 +182,7 @@ pub(super) struct Writer {
     pub(super) knows_state: bool,
     /// Whether the next commit must write the state.
     pub(super) needs_state: bool,
-    /// Whether the database was found deleted or replaced while it was open.
+    /// Whether the database was found deleted or replaced while it was open, and the history does not say so yet.
     pub(super) was_replaced: bool,
 }
 
@@ -224,7 +230,7 @@ impl Writer {
                 false
             };
             (progress.ticket, progress.has_room) = (ticket, self.reserve.is_whole());
-            progress.was_replaced |= self.was_replaced;
+            progress.was_replaced |= self.progress.borrow().was_replaced;
             self.progress.send_if_modified(|last| std::mem::replace(last, progress) != progress);
             if stop {
                 return;
@@ -349,6 +355,7 @@ impl Writer {
         if is_replaced {
             tracing::error!(folder = %self.folder, "another program has deleted or replaced the open database");
             (self.database, self.was_replaced) = (None, true);
+            self.progress.send_modify(|progress| progress.was_replaced = true);
         }
         is_replaced
     }
@@ -401,7 +408,7 @@ impl Writer {
             .set_vehicle(&self.vehicle)
             .and_then(|()| database.commit(&[RowBatch { stamp: *now, rows }]))
             .map_err(|error| error.to_string())?;
-        self.knows_state = true;
+        (self.knows_state, self.was_replaced) = (true, false);
         Ok(database)
     }
 }

@@ -1,7 +1,7 @@
 //! Exports the results of logs as tables of estimates, half-cycles and alarms, in Parquet or CSV format.
 //!
-//! Input: a configuration and logs. Output: for each log, a folder `NAME/` with `estimates`, `half_cycles` and `alarms`
-//! (`.parquet` or `.csv`; see [`columns`] for columns and units), and with `about.json`. `about.json` is written last:
+//! Input: a configuration and logs. Output: for each log, a folder `NAME/` with `estimates`, `half_cycles`, `alarms` and
+//! `use_record` (`.parquet` or `.csv`; see [`columns`] for columns and units), and with `about.json`. `about.json` is written last:
 //! if it exists, the tables are complete. A file gets its final name only when it is complete. Memory holds one row
 //! group per table and log, no matter how long the log is. If a log cannot be replayed, its folder gets no new file,
 //! and the other logs continue.
@@ -18,7 +18,7 @@ use std::sync::Arc;
 use serde::Serialize;
 use serde_json::json;
 
-use self::rows::{AlarmRow, EstimateRow, HalfCycleRow};
+use self::rows::{AlarmRow, EstimateRow, HalfCycleRow, UseRow};
 use self::table::TableFile;
 use super::drive::{DriveSummary, LogAccess, drive};
 use super::vehicle::LearnedModel;
@@ -26,6 +26,7 @@ use super::vehicle::LearnedModel;
 use crate::config::Config;
 use crate::error::{LabError, create_folder};
 use crate::fields::Fields;
+use crate::health::UseRecord;
 use crate::io::stamp;
 use crate::monitor::{Event, EventKind, Monitor, Outputs};
 use crate::quantity::{CellIndex, Timestamp};
@@ -124,12 +125,14 @@ pub(super) fn export(
     let out = Outputs { want_estimates: true, ..Outputs::default() };
     let source = (settings.access.open)(config, logs);
     let log = Path::new(&logs.iter().map(|log| log.display().to_string()).collect::<Vec<_>>().join(", ")).to_owned();
-    let mut model = None;
+    let (mut model, mut record) = (None, UseRecord::default());
     let mut each = |monitor: &Monitor, out: &mut Outputs| {
         if out.events.iter().any(|event| matches!(event.kind, EventKind::Model { .. })) {
             let view = monitor.model();
-            model = view.label.zip(view.own.cloned()).map(|(label, own)| LearnedModel { label, own });
+            let has_prior = view.fleet.is_some();
+            model = view.label.zip(view.own.cloned()).map(|(label, own)| LearnedModel { label, own, has_prior });
         }
+        record = *monitor.use_record();
         let result = tables.take(monitor, out);
         out.clear();
         result
@@ -140,7 +143,7 @@ pub(super) fn export(
     let metadata = metadata(config, &log, span, settings);
     let mut notes = driven.notes.clone();
     notes.extend(remove_about(&folder, &log)?);
-    let rows = tables.finish(&metadata)?;
+    let rows = tables.finish(&record, &metadata)?;
     let exported = ExportResult { log, folder, rows, days: driven.days(), notes, model };
     write_about(&exported, &driven, metadata)?;
     Ok(exported)
@@ -236,12 +239,13 @@ pub(super) fn clean(name: &str) -> String {
     if name.starts_with('.') { format!("_{name}") } else { name }
 }
 
-/// Writers of the three tables of one log.
+/// Writers of the tables of one log.
 struct LogTables {
     log: Arc<str>,
     estimates: Option<TableFile<EstimateRow>>,
     half_cycles: TableFile<HalfCycleRow>,
     alarms: TableFile<AlarmRow>,
+    uses: TableFile<UseRow>,
     period_ns: i64,
     first: Option<Timestamp>,
     /// For each cell, the number of the period to which the last written estimate belongs.
@@ -265,6 +269,7 @@ impl LogTables {
                 .transpose()?,
             half_cycles: TableFile::create(&path("half_cycles"), form, &columns::HALF_CYCLES)?,
             alarms: TableFile::create(&path("alarms"), form, columns::ALARMS)?,
+            uses: TableFile::create(&path("use_record"), form, columns::USE_RECORD)?,
             period_ns: (settings.period_s.unwrap_or(0.0) * 1e9) as i64,
             first: None,
             periods: vec![None; cells],
@@ -330,10 +335,16 @@ impl LogTables {
     }
 
     /// Completes the files and writes their metadata. Returns the number of rows of each table.
-    fn finish(self, metadata: &[(&'static str, String)]) -> Result<BTreeMap<&'static str, u64>, LabError> {
+    fn finish(
+        mut self,
+        record: &UseRecord,
+        metadata: &[(&'static str, String)],
+    ) -> Result<BTreeMap<&'static str, u64>, LabError> {
+        UseRow::of_record(&self.log, record)?.iter().try_for_each(|row| self.uses.push(row))?;
         let mut rows = BTreeMap::from([
             ("half_cycles", self.half_cycles.finish(metadata)?),
             ("alarms", self.alarms.finish(metadata)?),
+            ("use_record", self.uses.finish(metadata)?),
         ]);
         if let Some(estimates) = self.estimates {
             rows.insert("estimates", estimates.finish(metadata)?);

@@ -16,18 +16,18 @@ const LEAST_VEHICLES: usize = 3;
 
 /// Writes the learned models of all vehicles, in the order of the vehicles' names.
 pub(super) fn write_models(folder: &Path, models: &[LearnedModel]) -> Result<(), LabError> {
-    let lines = models.iter().map(serde_json::to_string).collect::<Result<Vec<_>, _>>()?;
-    Ok(crate::write_file(
-        &folder.join(MODELS),
-        lines.iter().map(|line| line.clone() + "\n").collect::<String>().as_bytes(),
-    )?)
+    let mut text = String::new();
+    for model in models {
+        text += &(serde_json::to_string(model)? + "\n");
+    }
+    Ok(crate::write_file(&folder.join(MODELS), text.as_bytes())?)
 }
 
 /// Combines the models whose label is wanted, in a folder of merged tables.
 ///
 /// # Errors
 /// The file is missing or damaged, the wanted models have several labels, or fewer than three vehicles have a wanted
-/// model.
+/// model. Vehicles that started from a prior do not count.
 pub fn combine(folder: &Path, is_wanted: impl Fn(&Label) -> bool) -> Result<FleetPrior, LabError> {
     let path = folder.join(MODELS);
     let fault = |what: &str| LabError::Data(format!("{}: {what}", path.display()));
@@ -36,8 +36,12 @@ pub fn combine(folder: &Path, is_wanted: impl Fn(&Label) -> bool) -> Result<Flee
     let mut by_label: Vec<(Label, Vec<OwnModel>)> = Vec::new();
     for (number, line) in (1..).zip(text.lines()) {
         let of_line = |error: &dyn std::fmt::Display| fault(&format!("line {number}: {error}"));
-        let LearnedModel { label, own } = serde_json::from_str(line).map_err(|error| of_line(&error))?;
+        let LearnedModel { label, own, has_prior } = serde_json::from_str(line).map_err(|error| of_line(&error))?;
         own.check().map_err(|error| of_line(&error))?;
+        if has_prior {
+            // Its model repeats what its prior says, so it would count the same vehicles twice.
+            continue;
+        }
         match by_label.iter_mut().find(|(known, _)| *known == label) {
             Some((_, models)) => models.push(own),
             None => by_label.push((label, vec![own])),
@@ -46,10 +50,10 @@ pub fn combine(folder: &Path, is_wanted: impl Fn(&Label) -> bool) -> Result<Flee
     let found: Vec<String> = by_label.iter().map(|(label, models)| format!("{label}: {}", models.len())).collect();
     let found = if found.is_empty() { "none".to_owned() } else { found.join("; ") };
     by_label.retain(|(label, _)| is_wanted(label));
-    let [(label, models)] = by_label.as_slice() else {
-        let what =
-            format!("learned models of {} wanted labels, must be 1 (vehicles with a model: {found})", by_label.len());
-        return Err(fault(&what));
+    let (label, models) = match by_label.as_slice() {
+        [(label, models)] => (label, models),
+        [] => return Err(fault(&format!("no vehicle has a suitable model (vehicles with a model: {found})"))),
+        _ => return Err(fault(&format!("several labels, choose one by chemistry and rated capacity: {found}"))),
     };
     if models.len() < LEAST_VEHICLES {
         let what = format!("{} vehicles have a model of {label}, must be at least {LEAST_VEHICLES}", models.len());

@@ -65,6 +65,8 @@ pub struct LearnedModel {
     pub label: Label,
     /// The model.
     pub own: OwnModel,
+    /// Whether learning started from the prior of a fleet (`pack.prior`).
+    pub has_prior: bool,
 }
 
 impl VehicleRecord {

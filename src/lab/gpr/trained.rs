@@ -83,11 +83,8 @@ impl TrainedModel {
         let fail = |what: String| LabError::Data(format!("{}: {what}", path.display()));
         let unread =
             |error: std::io::Error| LabError::of_io(format!("{}: cannot be read: {error}", path.display()), &error);
-        let size = std::fs::metadata(path).map_err(unread)?.len();
-        if size > MAX_BYTES {
-            return Err(fail(format!("{size} bytes, must be at most {MAX_BYTES}")));
-        }
-        let text = bounded_file::read_text(path).map_err(unread)?;
+        let bytes = bounded_file::read_up_to(path, MAX_BYTES).map_err(unread)?;
+        let text = String::from_utf8(bytes).map_err(|error| unread(std::io::Error::other(error)))?;
         let (first, rest) = text
             .split_once('\n')
             .ok_or_else(|| fail("has one line, must have three: not a model file of `packwatch gpr train`".into()))?;

@@ -7,10 +7,13 @@
 
 use super::energy::Discharge;
 use super::field::Field;
+use super::losses::is_too_much;
 use super::record::{CellRecord, Learned, Record};
 
 use crate::cell::CellModel;
 use crate::config::Config;
+use crate::health::UseRecord;
+use crate::health::use_record::{LimitUse, RangeUse};
 use crate::monitor::{Downtime, ModelState, Monitor, Outputs, Snapshot};
 use crate::quantity::{CellIndex, Channel, Timestamp, catalogue};
 
@@ -50,6 +53,9 @@ pub type Known = Result<Quantity, String>;
 pub struct Condition {
     values: Vec<(Field, Known)>,
     rated: Rated,
+    use_record: UseRecord,
+    /// Time of the state.
+    time: Timestamp,
 }
 
 /// Values of the new battery from configuration and command line. A passport with other values belongs to another
@@ -72,18 +78,40 @@ impl Condition {
         let moved = battery.moved_ah(terms);
         let values = Field::ALL.map(|field| (field, battery.value(field, terms, &moved).and_then(dated)));
         let rated = Rated { capacity_ah: Some(battery.rated_ah()), energy_kwh: terms.certified_kwh };
-        Ok(Self { values: values.to_vec(), rated })
+        let time = battery.wall(battery.monitor.now());
+        Ok(Self { values: values.to_vec(), rated, use_record: *battery.monitor.use_record(), time })
     }
 
     /// Creates values for a test.
     #[cfg(test)]
     pub(super) fn of(values: Vec<(Field, Known)>, rated: Rated) -> Self {
-        Self { values, rated }
+        Self { values, rated, use_record: UseRecord::default(), time: Timestamp::default() }
     }
 
     /// Returns the values of the new battery.
     pub(super) fn rated(&self) -> Rated {
         self.rated
+    }
+
+    /// Returns how the pack was used.
+    pub(super) fn use_record(&self) -> &UseRecord {
+        &self.use_record
+    }
+
+    /// Returns a text for each limit that was exceeded, with the time of the state.
+    pub(super) fn events(&self) -> Vec<(String, Timestamp)> {
+        let UseRecord { temperature_c, voltage_v, current_a, .. } = &self.use_record;
+        let limits = [
+            ("temperature above its limit", temperature_c.above),
+            ("temperature below its limit", temperature_c.below),
+            ("overcharge: cell voltage above its limit", voltage_v.above),
+            ("deep discharge: cell voltage below its limit", voltage_v.below),
+            ("charging current above its limit", current_a.below),
+            ("discharging current above its limit", current_a.above),
+        ];
+        let counted = limits.into_iter().filter(|(_, limit)| limit.events > 0);
+        let text = |what: &str, limit: LimitUse| format!("{what}: {} x, {:.0} s", limit.events, limit.beyond_s);
+        counted.map(|(what, limit)| (text(what, limit), self.time)).collect()
     }
 
     /// Returns a value, or the reason why it is unknown.
@@ -179,6 +207,10 @@ impl<'a> Battery<'a> {
             Field::EnergyThroughput => self.moved_kwh(terms),
             Field::StateOfCharge => self.soc(),
             Field::Temperature => self.temperature(),
+            Field::TimeHot => self.time_beyond(terms, |it| it.above, |limit| limit.beyond_s),
+            Field::TimeCold => self.time_beyond(terms, |it| it.below, |limit| limit.beyond_s),
+            Field::TimeHotCharging => self.time_beyond(terms, |it| it.above, |limit| limit.beyond_charging_s),
+            Field::TimeColdCharging => self.time_beyond(terms, |it| it.below, |limit| limit.beyond_charging_s),
             Field::RemainingCapacity => self.capacity_ah(),
             Field::CapacityFade => {
                 let of_rated = self.capacity_ah()?.times(100.0 / rated_ah);
@@ -277,6 +309,31 @@ impl<'a> Battery<'a> {
         let hottest = readings.max_by(|a, b| a.2.total_cmp(&b.2));
         let (_, time, value) = hottest.ok_or("no temperature sensor has given a valid reading")?;
         Ok(Quantity { value, std: None, time: self.wall(time) })
+    }
+
+    /// Returns a time beyond a temperature limit (min).
+    fn time_beyond(&self, terms: &Terms, side: fn(&RangeUse) -> LimitUse, seconds: fn(LimitUse) -> f64) -> Known {
+        if terms.moved_before_ah != Some(0.0) {
+            return Err("the record does not start with the new battery (--throughput-before-ah 0)".to_owned());
+        }
+        let UseRecord { temperature_c, half_cycles, c_rate, current_a, .. } = self.monitor.use_record();
+        let limit = side(temperature_c);
+        let counted = half_cycles.discharges.iter().sum::<u64>() + half_cycles.charges + half_cycles.unknown;
+        if let Some(gap) = &self.record.gap {
+            return Err(gap.clone());
+        }
+        if counted < self.record.half_cycles() {
+            return Err("an earlier version of the program did not count the use".to_owned());
+        }
+        if limit.known_s == 0.0 {
+            return Err("no temperature limit is configured ([outlook]), or no temperature was known".to_owned());
+        }
+        let moving_s: f64 = c_rate.charge_s.iter().chain(&c_rate.discharge_s).sum();
+        let unknown_s = moving_s + c_rate.rest_s + current_a.unknown_s - limit.known_s;
+        if is_too_much(unknown_s, limit.known_s) {
+            return Err(format!("the temperature, or its limit, was unknown for {unknown_s:.0} s of the record"));
+        }
+        Ok(Quantity { value: seconds(limit) / 60.0, std: None, time: self.wall(self.monitor.now()) })
     }
 
     /// Returns the learned values of every cell.

@@ -7,7 +7,7 @@
 
 use serde_json::{Map, Value, json};
 
-use super::condition::{Condition, RATED_TOLERANCE, Rated};
+use super::condition::{Condition, Quantity, RATED_TOLERANCE, Rated};
 use super::field::{Field, Place, Standard, rounded};
 use super::shape::{Verdict, joined};
 use super::standards;
@@ -25,13 +25,20 @@ pub fn passport(standard: Standard, condition: &Condition, manufacturer: Value) 
         return Err(vec!["static part: must be an object".to_owned()]);
     };
     let mut faults = Vec::new();
-    for (field, place) in places(standard) {
-        if let Ok(quantity) = condition.get(field) {
-            let (number, time) = (field.number(quantity.value), Value::from(format_utc(quantity.time)));
-            for (name, value) in [(place.value, number), (place.time, time)] {
-                faults.extend(insert(&mut root, place.group, name, value).err());
-            }
+    let known: Vec<(Field, Place, Quantity)> =
+        places(standard).filter_map(|(field, place)| Some((field, place, condition.get(field).ok()?))).collect();
+    for (index, (field, place, quantity)) in known.iter().enumerate() {
+        faults.extend(insert(&mut root, place.group, place.value, field.number(quantity.value)).err());
+        if known[..index].iter().any(|(_, before, _)| before.group == place.group) {
+            continue;
         }
+        // The temperatures share a group, which has the time of the oldest value.
+        let of_group = known.iter().filter(|(_, other, _)| other.group == place.group);
+        let oldest = of_group.map(|(.., quantity)| quantity.time).min().unwrap_or(quantity.time);
+        faults.extend(insert(&mut root, place.group, place.time, Value::from(format_utc(oldest))).err());
+    }
+    if standard == Standard::ProductCondition {
+        add_events(&mut root, condition);
     }
     let document = Value::Object(root);
     faults.extend(other_battery(condition.rated(), &document));
@@ -97,11 +104,26 @@ pub fn details(standard: Standard, condition: &Condition, vehicle: &VehicleIdent
         "vehicle": vehicle,
         "values": values,
         "absent": absent,
+        "use_record": condition.use_record(),
     })
 }
 
 fn places(standard: Standard) -> impl Iterator<Item = (Field, Place)> {
     Field::ALL.into_iter().filter_map(move |field| Some((field, field.place(standard)?)))
+}
+
+/// Adds the counted events to the list of negative events. The static part may also state events.
+fn add_events(root: &mut Map<String, Value>, condition: &Condition) {
+    let events = condition.events().into_iter();
+    let mut events =
+        events.map(|(what, time)| json!({ "NegativeEventValue": what, "LastUpdate": format_utc(time) })).peekable();
+    if events.peek().is_none() {
+        return;
+    }
+    // If the static part has something other than a list, the check of the form reports it.
+    if let Some(list) = root.entry("NegativeEvents").or_insert_with(|| json!([])).as_array_mut() {
+        list.extend(events);
+    }
 }
 
 /// Whether a path is above a group, or equals it.
@@ -153,7 +175,7 @@ fn missing_fault(standard: Standard, condition: &Condition, path: &str) -> Strin
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::passport::condition::{Known, Quantity};
+    use crate::passport::condition::Known;
     use crate::quantity::Timestamp;
 
     fn known(value: f64) -> Known {
@@ -203,7 +225,7 @@ mod tests {
         );
         let temperatures =
             json!({ "InformationOnAccidents": [], "TemperatureInformation": { "TimeExtremeHighTemp": 4.5 } });
-        let built = passport(Standard::ProductCondition, &condition(&[]), temperatures).unwrap();
+        let built = passport(Standard::ProductCondition, &condition(&[Field::TimeHot]), temperatures).unwrap();
         assert_eq!(built["TemperatureInformation"]["TimeExtremeHighTemp"], 4.5, "both parts of one group");
     }
 

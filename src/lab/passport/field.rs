@@ -5,6 +5,9 @@
 
 use serde_json::Value;
 
+/// Group of the temperatures in IDTA, which share one time.
+const TEMPERATURES: &str = "TemperatureInformation";
+
 /// Form of a passport.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Standard {
@@ -39,6 +42,14 @@ pub enum Field {
     StateOfCharge,
     /// Highest temperature of the sensors (degrees C).
     Temperature,
+    /// Time above the highest temperature (min).
+    TimeHot,
+    /// Time below the lowest temperature (min).
+    TimeCold,
+    /// Time of charging above the highest temperature (min).
+    TimeHotCharging,
+    /// Time of charging below the lowest temperature (min).
+    TimeColdCharging,
     /// Capacity (Ah).
     RemainingCapacity,
     /// Capacity lost (%) of the rated capacity.
@@ -80,12 +91,16 @@ impl Place {
 
 impl Field {
     /// All values, in the order in which they are listed.
-    pub const ALL: [Self; 13] = [
+    pub const ALL: [Self; 17] = [
         Self::FullCycles,
         Self::CapacityThroughput,
         Self::EnergyThroughput,
         Self::StateOfCharge,
         Self::Temperature,
+        Self::TimeHot,
+        Self::TimeCold,
+        Self::TimeHotCharging,
+        Self::TimeColdCharging,
         Self::RemainingCapacity,
         Self::CapacityFade,
         Self::CellResistanceIncrease,
@@ -114,6 +129,10 @@ impl Field {
                 ("state_of_charge", "%", "dischargeable charge over the charge between full and empty")
             }
             Self::Temperature => ("temperature", "degrees C", "highest of the sensors' latest readings"),
+            Self::TimeHot => ("time_hot", "min", "time with a sensor above the highest temperature ([outlook])"),
+            Self::TimeCold => ("time_cold", "min", "time with a sensor below the lowest temperature ([outlook])"),
+            Self::TimeHotCharging => ("time_hot_charging", "min", "part of time_hot in which the pack was charged"),
+            Self::TimeColdCharging => ("time_cold_charging", "min", "part of time_cold in which the pack was charged"),
             Self::RemainingCapacity => {
                 ("remaining_capacity", "Ah", "capacity of the weakest cell times the parallel strings")
             }
@@ -159,7 +178,11 @@ impl Field {
             Self::StateOfCharge => {
                 (Some(("StateOfCharge", "StateOfChargeValue")), Some("performance.dynamic.stateOfCharge"))
             }
-            Self::Temperature => (Some(("TemperatureInformation", "MeasuredTemp")), None),
+            Self::Temperature => (Some((TEMPERATURES, "MeasuredTemp")), None),
+            Self::TimeHot => (Some((TEMPERATURES, "TimeExtremeHighTemp")), None),
+            Self::TimeCold => (Some((TEMPERATURES, "TimeExtremeLowTemp")), None),
+            Self::TimeHotCharging => (Some((TEMPERATURES, "TimeExtremeHighTempCharging")), None),
+            Self::TimeColdCharging => (Some((TEMPERATURES, "TimeExtremeLowTempCharging")), None),
             Self::RemainingCapacity => {
                 (Some(("RemainingCapacity", "RemainingCapacityValue")), Some("performance.dynamic.capacity.capacity"))
             }
@@ -213,12 +236,11 @@ mod tests {
     #[test]
     fn every_value_has_a_unique_place() {
         for standard in [Standard::ProductCondition, Standard::BatteryPass] {
-            let mut groups: Vec<&str> =
-                Field::ALL.iter().filter_map(|field| field.place(standard)).map(|place| place.group).collect();
-            let places = groups.len();
-            groups.sort_unstable();
-            groups.dedup();
-            assert_eq!(groups.len(), places, "{standard:?}");
+            let mut all: Vec<_> = Field::ALL.iter().filter_map(|field| field.place(standard)).collect();
+            let places = all.len();
+            all.sort_unstable_by_key(|place| (place.group, place.value));
+            all.dedup_by_key(|place| (place.group, place.value));
+            assert_eq!(all.len(), places, "{standard:?}");
         }
         let has_place = |field: &Field| {
             [Standard::ProductCondition, Standard::BatteryPass].iter().any(|standard| field.place(*standard).is_some())

@@ -28,6 +28,7 @@ pub(super) struct Learned {
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct CellRecord {
     pub(super) moved: Throughput,
+    half_cycles: u64,
     pub(super) learned: Option<Learned>,
     /// In a replay: power of the last reading of voltage and current.
     power: Option<Power>,
@@ -227,7 +228,9 @@ impl Record {
         let (Some(cell), Some(charge_ah)) = (fields.whole("cell"), fields.number("charge_ah")) else { return };
         let duration_s = fields.number("duration_s").unwrap_or(0.0);
         let mode = if fields.text("mode") == "charge" { Mode::Charge } else { Mode::Discharge };
-        self.cell(cell as usize).moved.add(mode, charge_ah, duration_s);
+        let cell = self.cell(cell as usize);
+        cell.moved.add(mode, charge_ah, duration_s);
+        cell.half_cycles += 1;
         self.moved_until_ns = Some(at_ns);
     }
 
@@ -249,6 +252,11 @@ impl Record {
     pub(super) fn moved(&self, strings: f64) -> (f64, f64) {
         let most = self.fullest();
         (strings * most.charge_ah, (most.discharging_s - most.charging_s).abs() / 3600.0)
+    }
+
+    /// Returns the number of recorded half-cycles.
+    pub(super) fn half_cycles(&self) -> u64 {
+        self.cells.iter().map(|cell| cell.half_cycles).max().unwrap_or(0)
     }
 
     /// Returns the sums of the cell that moved the largest charge.

@@ -4,6 +4,7 @@ use super::reference::Reference;
 use crate::cell_faults::{CellFaultDetector, Imbalance, UnknownImbalance};
 use crate::config::Config;
 use crate::config::cell_model::SourcedModel;
+use crate::health::UseRecord;
 use crate::quantity::CellIndex;
 
 /// Content of a page in addition to the data.
@@ -21,6 +22,8 @@ pub struct PageContext<'a> {
     pub diagnosis: Option<&'a CellFaultDetector>,
     /// What the differences between the cells cost the pack; `None` = the cells were not compared.
     pub imbalance: Option<Result<Imbalance, UnknownImbalance>>,
+    /// How the pack was used; `None` = unknown.
+    pub use_record: Option<UseRecord>,
     /// Measured or true values.
     pub reference: Reference,
     /// Lines of the provenance, each with name and value.

@@ -155,6 +155,7 @@ impl Data {
         let pack = entries.iter().map(|entry| entry.pack).max();
         data.source.pack = pack;
         entries.iter().filter(|entry| Some(entry.pack) == pack).for_each(|entry| data.take_entry(entry));
+        data.source.doubt = reader.damage();
         Ok(data)
     }
 

@@ -6,7 +6,7 @@ use super::context::PageContext;
 use super::data::{Data, Origin};
 use super::known::Knowledge;
 use super::pictures::{self, NOT_STORED};
-use super::{forecast, format, model, summary};
+use super::{forecast, format, model, summary, usage};
 use crate::chart::{Picture, Size, variables};
 use crate::config::Config;
 use crate::{cell_fault_pictures, pack_view};
@@ -121,7 +121,7 @@ pub fn page(data: &Data, context: &PageContext<'_>) -> String {
                         (self::section(section, data, &pictures))
                         @match section.id {
                             "capacity" => { (forecast_note(data, &outlook)) }
-                            ALARMS_AFTER => { (alarms(data, &pictures)) }
+                            ALARMS_AFTER => { (use_of(context)) (alarms(data, &pictures)) }
                             "findings" => { (cost(context, &quiet)) }
                             "model" => { (knowledge(data, context)) }
                             "estimator" => { (estimator(data)) }
@@ -159,8 +159,9 @@ fn heading(data: &Data, context: &PageContext<'_>) -> Markup {
     };
     // The links are in the order of the sections on the page.
     let links = SECTIONS.iter().flat_map(|section| {
-        let alarms = (section.id == ALARMS_AFTER).then_some(("alarms", "Alarms"));
-        [Some((section.id, section.title)), alarms].into_iter().flatten()
+        let is_before = section.id == ALARMS_AFTER;
+        let more = [("use", "Use"), ("alarms", "Alarms")].into_iter().filter(move |_| is_before);
+        [(section.id, section.title)].into_iter().chain(more)
     });
     html! {
         h1 { (context.title) }
@@ -294,6 +295,21 @@ fn fan_note(data: &Data, outlook: &forecast::Outlook) -> String {
          dashed line meets it; in nine of ten, within the band.{}{doubt}",
         gap(data, outlook)
     )
+}
+
+/// How the pack was used.
+fn use_of(context: &PageContext<'_>) -> Markup {
+    let Some(record) = &context.use_record else {
+        return empty("use", "Use", "unknown: the state of the pack is missing");
+    };
+    html! {
+        section {
+            h2 #use { "Use" }
+            p.soft { "Counted while the program received data. An event is at least 1 s beyond a limit; the next needs 10 s within it." }
+            (table(&["", "Time beyond", "Events", "Time known", "Time unknown", "Most extreme"], usage::limits(record), 6))
+            (pairs(&usage::rows(record)))
+        }
+    }
 }
 
 fn alarms(data: &Data, pictures: &[(String, Picture)]) -> Markup {

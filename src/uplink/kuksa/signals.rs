@@ -162,7 +162,7 @@ fn path(path: VssPath, part: Part) -> (Origin, Cow<'static, str>) {
 const fn vss_unit(unit: Unit) -> (Option<&'static str>, f64) {
     match unit {
         Unit::Level | Unit::Fraction => (Some("percent"), 100.0),
-        Unit::Ratio | Unit::Cycles => (None, 1.0),
+        Unit::Ratio | Unit::Cycles | Unit::Count => (None, 1.0),
         Unit::Volts => (Some("V"), 1.0),
         Unit::Amperes => (Some("A"), -1.0),
         Unit::Celsius => (Some("Celsius"), 1.0),

@@ -50,7 +50,7 @@ fn describe(config: &mut Value, kind: Kind) {
             if !class.is_empty() {
                 config["device_class"] = class.into();
             }
-            config["state_class"] = "measurement".into();
+            config["state_class"] = if class == "energy" { "total_increasing" } else { "measurement" }.into();
             config["suggested_display_precision"] = decimals.into();
         }
         Kind::Number => config["state_class"] = "measurement".into(),

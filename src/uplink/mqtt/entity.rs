@@ -90,6 +90,8 @@ pub fn published(quantity: Quantity, part: Part, value: Option<f64>) -> Value {
     rounded(value.map(|value| factor * value), decimals)
 }
 
+/// A sum of energy that only grows.
+const ENERGY: Kind = Kind::Measured { unit: "Wh", class: "energy", decimals: 0 };
 /// Device class of a state of charge.
 const BATTERY: &str = "battery";
 
@@ -120,6 +122,7 @@ const fn measure(unit: Unit) -> (Measure, f64) {
         Unit::Seconds => ("s", "duration", 0, 1.0),
         Unit::Days => ("d", "duration", 1, 1.0),
         Unit::Cycles => ("cycles", "", 1, 1.0),
+        Unit::Count => ("", "", 0, 1.0),
     };
     (Measure { unit, class, decimals }, factor)
 }
@@ -154,7 +157,7 @@ pub fn entities() -> &'static [Entity] {
 }
 
 /// Entities outside the catalogue.
-fn derived() -> [Entity; 19] {
+fn derived() -> [Entity; 21] {
     let volts = measure(Unit::Volts).0.kind();
     let millivolts = Kind::Measured { unit: "mV", class: "voltage", decimals: 0 };
     let watts = Kind::Measured { unit: "W", class: "power", decimals: 0 };
@@ -168,6 +171,10 @@ fn derived() -> [Entity; 19] {
             rounded(d.least(Quantity::Temperature).map(|(_, celsius)| celsius), 1)
         }),
         Entity::new("stat_batt_power", "Battery Power", watts, |d| rounded(power_w(&d.pack.values), 0)),
+        Entity::new("charged_energy", "Charged Energy", ENERGY, |d| rounded(d.pack.moved.map(|sum| sum.charged_wh), 0)),
+        Entity::new("discharged_energy", "Discharged Energy", ENERGY, |d| {
+            rounded(d.pack.moved.map(|sum| sum.discharged_wh), 0)
+        }),
         Entity::new("cell_max_voltage", "Cell Max Voltage", volts, |d| {
             rounded(d.greatest(Quantity::Voltage).map(|(_, volts)| volts), 3)
         }),

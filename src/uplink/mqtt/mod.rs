@@ -23,6 +23,7 @@ pub mod queue;
 pub mod recorder;
 pub mod settings;
 
+use packwatch_host::io::runtime::new_runtime;
 use packwatch_host::io::stop::Stop;
 use tokio::sync::watch;
 
@@ -57,7 +58,7 @@ pub const ONLINE: &str = "online";
 /// Payload of an unavailable state.
 pub const OFFLINE: &str = "offline";
 
-/// Runs until SIGTERM or SIGINT.
+/// Runs until a signal of [`Stop`].
 ///
 /// # Errors
 /// Fails if the settings are invalid or lack the table `[mqtt]`, or if the queue cannot be opened.
@@ -76,8 +77,7 @@ fn serve(settings: &Settings, mqtt: &MqttSettings) -> Result<(), String> {
         tracing::warn!(host = mqtt.host, "the password is sent in plain text; add a table [mqtt.tls]");
     }
     let queue = Queue::open(&mqtt.history)?;
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
-    let runtime = runtime.map_err(|error| format!("cannot start: {error}"))?;
+    let runtime = new_runtime().map_err(|error| format!("cannot start: {error}"))?;
     runtime.block_on(async {
         let mut stop = Stop::new(None).map_err(|error| format!("signals: {error}"))?;
         let documents = follow(&settings.status.socket);

@@ -36,6 +36,8 @@ pub struct Recorder<'a> {
     period_s: u64,
     due: Option<Timestamp>,
     handled: Option<Handled>,
+    /// Whether the queue's note of the handled events is of another version.
+    has_other_note: bool,
     is_numbered: bool,
     works: Cell<bool>,
     drops: Cell<bool>,
@@ -44,9 +46,11 @@ pub struct Recorder<'a> {
 impl<'a> Recorder<'a> {
     /// Creates a recorder that queues a sample every `period_s` seconds; 0 = no samples.
     pub fn new(queue: &'a Queue, period_s: u64) -> Self {
-        let handled = queue.seen().and_then(|seen| serde_json::from_str(&seen).ok());
+        let seen = queue.seen();
+        let handled = seen.as_ref().and_then(|seen| serde_json::from_str(seen).ok());
+        let has_other_note = seen.is_some() && handled.is_none();
         let (works, drops) = (Cell::new(true), Cell::new(false));
-        Self { queue, period_s, due: None, handled, is_numbered: true, works, drops }
+        Self { queue, period_s, due: None, handled, has_other_note, is_numbered: true, works, drops }
     }
 
     /// Handles documents until the stream ends.
@@ -107,12 +111,14 @@ impl<'a> Recorder<'a> {
         let handled = match self.handled {
             Some(handled) if is_same_run => handled.count,
             Some(_) => 0,
+            // An earlier version has handled the listed events; later ones may be missing.
+            None if self.has_other_note => total,
             None => total - listed,
         };
         let missed = (total - listed).saturating_sub(handled);
         let time = document.time.nanos();
         let mut events = Vec::new();
-        if self.handled.is_some() && !is_same_run {
+        if !is_same_run && (self.handled.is_some() || self.has_other_note) {
             events.push(json!({ "event": "daemon_restarted", "time": time }));
         }
         if missed > 0 {

@@ -18,6 +18,7 @@ offset     current sensor -0.034 ± 0.011 A (reading less true current)
 model      learning
 losses     lithium 6.1 ± 1.2 %, negative electrode 2.2 ± 2.3 %, positive electrode 2.1 ± 2.4 %
 life       412 equivalent full cycles (90 %: 208 to 933) (cell 1), 533 days at the recent use
+use        events beyond limits -, fast charges 12, at rest above 80 % -
 interface  can0 up: 86400 frames in, 6 lost, 1200 out, 17 not sent, 4 errors, 1 bus-off, 1 reconnects
 interface  can1 missing: 86400 frames in, 6 lost, 1200 out, 17 not sent, 4 errors, 1 bus-off, 1 reconnects
 counted    123456 readings used, 7 rejected; 3 late ticks; 99 % of estimates within 5.00 ms

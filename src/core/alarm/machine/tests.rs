@@ -309,3 +309,34 @@ fn wire_codes_match_alarm_frame() {
     let codes = STATES.map(AlarmState::wire_code);
     assert_eq!(codes, [6, 0, 3, 1, 1, 5, 4, 2]);
 }
+
+#[test]
+fn flickering_alarm_stays_raised_and_changes_seldom() {
+    let rule = RuleConfig { debounce_s: 0.0, debounce_events: 1, ..rule(false) };
+    for ends in [LimitCheck::Healthy, LimitCheck::Unknown] {
+        let mut machine = Machine::default();
+        let mut changes = Vec::new();
+        for second in 0..86_400 {
+            let check = if second % 2 == 0 { LimitCheck::Beyond } else { ends };
+            if let Some(change) = observe(&mut machine, &rule, f64::from(second), check) {
+                changes.push((second, change));
+            }
+            assert!(check != LimitCheck::Beyond || machine.state == AlarmState::Active, "raised at once");
+            assert!(check != LimitCheck::Unknown || machine.shown() == AlarmState::Suppressed, "second {second}");
+        }
+        assert_eq!(changes.iter().filter(|(second, _)| *second < 240).count(), 240, "{changes:?}");
+        assert!((515..=530).contains(&changes.len()), "{} changes on the first day", changes.len());
+        // The input is steady again: the alarm ends once.
+        observe(&mut machine, &rule, 86_400.0, LimitCheck::Beyond);
+        let after: Vec<_> =
+            (86_401..87_100).filter_map(|s| observe(&mut machine, &rule, f64::from(s), LimitCheck::Healthy)).collect();
+        assert_eq!(after.last(), Some(&Change::Cleared), "{after:?}");
+        assert!(!machine.state.is_raised());
+        // A backward step of the clock does not hold the alarm for longer.
+        for second in -1_000_000..-998_000 {
+            let check = if second < -999_999 { LimitCheck::Beyond } else { LimitCheck::Healthy };
+            observe(&mut machine, &rule, f64::from(second), check);
+        }
+        assert!(!machine.state.is_raised(), "{ends:?}");
+    }
+}

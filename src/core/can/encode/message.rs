@@ -139,6 +139,17 @@ impl OutputMessage {
         self
     }
 
+    /// The message without the signals whose [place](Self::with_places) is chosen.
+    pub(super) fn without(mut self, is_chosen: impl Fn(Option<usize>) -> bool) -> Self {
+        self.fields.retain(|field| !is_chosen(field.place));
+        self
+    }
+
+    /// The places of all signals.
+    pub(super) fn places(&self) -> impl Iterator<Item = usize> + '_ {
+        self.fields.iter().filter_map(|field| field.place)
+    }
+
     /// Encodes a page. `value` returns the value of a signal from its name and its [index](Self::with_places).
     /// `counter` is the protection's next counter, which this function advances. The trailer of an authenticated
     /// message stays 0; it is written once the freshness is known.

@@ -19,6 +19,7 @@ use crate::can::dbc::{Database, FrameFormat};
 use crate::can::e2e::Protection;
 use crate::can::secoc::{Authentication, Profile};
 use crate::can::{CanId, Frame};
+use crate::quantity::catalogue::{PackValues, Part, Quantity as Q};
 use crate::quantity::{CellIndex, Mode};
 
 /// Signals of a message with the functions that return their values.
@@ -57,6 +58,28 @@ const HEALTH: SignalTable<HealthFields, 18> = [
     ("ModelState", |f| f.model_state.map(f64::from)),
 ];
 const HEALTH_REQUIRED: usize = 8;
+
+/// Signals of the health frame with energy, time and power, which [`OutputPlan::without_outlook`] leaves out.
+const OUTLOOK: [(&str, Q, Part); 18] = [
+    ("RemainingEnergy", Q::RemainingEnergy, Part::Mean),
+    ("RemainingEnergyStd", Q::RemainingEnergy, Part::Std),
+    ("EnergyToFull", Q::EnergyToFull, Part::Mean),
+    ("EnergyToFullStd", Q::EnergyToFull, Part::Std),
+    ("TimeToEmpty", Q::TimeToEmpty, Part::Mean),
+    ("TimeToEmptyStd", Q::TimeToEmpty, Part::Std),
+    ("TimeToFull", Q::TimeToFull, Part::Mean),
+    ("TimeToFullStd", Q::TimeToFull, Part::Std),
+    ("TimeToTarget", Q::TimeToTarget, Part::Mean),
+    ("TimeToTargetStd", Q::TimeToTarget, Part::Std),
+    ("DischargePower2s", Q::DischargePower2s, Part::Mean),
+    ("DischargePower10s", Q::DischargePower10s, Part::Mean),
+    ("DischargePower10sStd", Q::DischargePower10s, Part::Std),
+    ("DischargePower30s", Q::DischargePower30s, Part::Mean),
+    ("ChargePower2s", Q::ChargePower2s, Part::Mean),
+    ("ChargePower10s", Q::ChargePower10s, Part::Mean),
+    ("ChargePower10sStd", Q::ChargePower10s, Part::Std),
+    ("ChargePower30s", Q::ChargePower30s, Part::Mean),
+];
 
 /// Signals on every page of the alarm frame.
 const ALARM: [&str; 6] = ["Rule", "State", "Severity", "Test", "Cell", "Acknowledged"];
@@ -117,6 +140,8 @@ pub struct HealthFields {
     pub lam_pe: [Option<f64>; 2],
     /// Wire code that says how well the cells' model is known.
     pub model_state: Option<u8>,
+    /// Energy, time and power of the pack.
+    pub outlook: PackValues,
 }
 
 /// Contents of one alarm frame.
@@ -197,7 +222,9 @@ impl OutputPlan {
         let mut message = |which: LayoutMessage, required: &[&str]| {
             OutputMessage::new(database, which.message(), required, &mut faults)
         };
-        let (status_names, health_names) = (STATUS.map(|(name, _)| name), HEALTH.map(|(name, _)| name));
+        let status_names = STATUS.map(|(name, _)| name);
+        let health_names: Vec<&str> =
+            HEALTH.iter().map(|(name, _)| *name).chain(OUTLOOK.iter().map(|(name, ..)| *name)).collect();
         let status = message(LayoutMessage::Status, &status_names);
         let health = message(LayoutMessage::Health, &health_names[..HEALTH_REQUIRED]);
         let alarm = message(LayoutMessage::Alarm, &ALARM);
@@ -215,6 +242,19 @@ impl OutputPlan {
             }
             _ => Err(PlanFaults(faults)),
         }
+    }
+
+    /// Leaves out the pages of the health frame that contain only energy, time and power.
+    #[must_use]
+    pub fn without_outlook(mut self) -> Self {
+        self.health = self.health.without(|place| place.is_some_and(|place| place >= HEALTH.len()));
+        self.pages = self.health.page_codes();
+        self
+    }
+
+    /// Whether the health frame contains energy, time or power.
+    pub fn has_outlook(&self) -> bool {
+        self.health.places().any(|place| place >= HEALTH.len())
     }
 
     /// The sent messages: status, health and alarm, followed by digest, reply and freshness if the layout has them.
@@ -297,7 +337,13 @@ impl OutputPlan {
     /// Encodes a page of the health frame, counted from 0, modulo the number of pages.
     pub fn health(&self, page: usize, fields: &HealthFields, counters: &mut SendCounters) -> Frame {
         let code = self.pages.get(page % self.pages.len().max(1)).copied().unwrap_or(0);
-        self.health.frame(code, &mut counters.health, |_, place| value_of(&HEALTH, fields, place))
+        self.health.frame(code, &mut counters.health, |_, place| {
+            let outlook = place.and_then(|place| OUTLOOK.get(place.checked_sub(HEALTH.len())?));
+            match outlook {
+                Some((_, quantity, part)) => fields.outlook.part(*quantity, *part),
+                None => value_of(&HEALTH, fields, place),
+            }
+        })
     }
 
     /// Encodes one alarm. Its value and its threshold are in the rule's own `Value_...` and `Threshold_...` signals.

@@ -225,6 +225,12 @@ impl Node {
         }
     }
 
+    /// Makes the cyclic DM1 due, unless a DM1 was sent less than a period ago.
+    pub(crate) fn resume_cyclic(&mut self, now: Timestamp, skipped_since: Timestamp) {
+        let earliest = skipped_since.plus_nanos(DM1_PERIOD_NS).max(now);
+        self.next_dm1 = self.next_dm1.min(earliest);
+    }
+
     fn poll_dm1(&mut self, now: Timestamp, out: &mut NodeOutputs) {
         let is_cyclic = self.next_dm1 <= now;
         let has_changed = self.codes.change_due().is_some_and(|due| due <= now);

@@ -76,6 +76,11 @@ fn vehicles_without_data_keep_label_spread() {
 }
 
 #[test]
+fn no_vehicle_gives_no_prior() {
+    assert_eq!(FleetPrior::new(&label(), &[]), None);
+}
+
+#[test]
 fn few_vehicles_leave_part_of_label_spread() {
     let std_ah = |count: u32| {
         let prior = FleetPrior::new(&label(), &taught(count, [0.0; 3])).unwrap();
@@ -94,9 +99,17 @@ fn damaged_priors_are_refused() {
     asymmetric.curve_covariance_v2[3][4] = 1.0;
     let mut negative = prior.clone();
     negative.spread.capacity = -0.1;
-    let mut falling = prior;
+    let mut falling = prior.clone();
     falling.mean.curve_v[5] = 9.0;
-    for damaged in [few, asymmetric, negative, falling] {
+    let mut exact = prior.clone();
+    exact.spread.log_resistance = 0.0;
+    let mut large = prior.clone();
+    large.mean.capacity.mean = 900.0;
+    let mut high = prior.clone();
+    high.mean.curve_v.iter_mut().for_each(|v| *v += 10.0);
+    let mut indefinite = prior;
+    (indefinite.curve_covariance_v2[3][4], indefinite.curve_covariance_v2[4][3]) = (1.0, 1.0);
+    for damaged in [few, asymmetric, negative, falling, exact, large, high, indefinite] {
         assert!(damaged.check().is_err(), "{damaged:?}");
     }
 }

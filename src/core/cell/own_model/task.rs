@@ -60,8 +60,8 @@ impl FitTask {
     pub fn run(&self) -> FitFindings {
         let is_enough = fit::says_enough(&self.label, &self.rows);
         let nothing = FitFindings { is_before_better: false, is_enough, fit: None, chemistry: None };
-        let Some(prior) = self.label.prior() else { return nothing };
-        let prior = LabelPrior { fleet: self.fleet.clone(), ..prior };
+        let prior = self.fleet.as_ref().map_or_else(|| self.label.prior(), FleetPrior::prior);
+        let Some(prior) = prior else { return nothing };
         let fit = fit::fit(&prior, &self.rows);
         let chemistry = if is_enough { self.better_chemistry(&prior, fit.as_ref()) } else { None };
         FitFindings { is_before_better: self.is_before_better(&prior), fit, chemistry, ..nothing }
@@ -77,7 +77,7 @@ impl FitTask {
     }
 
     /// The chemistry that explains the rows clearly better than the label's chemistry, if any. Each chemistry is judged
-    /// at the fitted capacity or at the rated capacity, whichever gives the lower cost.
+    /// at the fitted, rated or expected capacity, whichever gives the lowest cost.
     fn better_chemistry(&self, prior: &LabelPrior, fitted: Option<&Fit>) -> Option<Chemistry> {
         let Self { label, rows, .. } = self;
         // The better chemistry must be about 50 times more likely (a margin of 4). The margin grows if the misfit
@@ -85,7 +85,8 @@ impl FitTask {
         // costs of NCA and NMC differ by 4 to 9; the cost of LFP differs from all others by hundreds.
         let margin = 4.0 * fitted.map_or(1.0, |it| (it.misfit / 0.45).max(1.0));
         let fitted_ah = fitted.map(|it| it.own.capacity.mean);
-        let capacities_ah: Vec<f64> = [label.rated_ah].into_iter().chain(fitted_ah).collect();
+        let expected_ah = prior.expected.as_ref().map(|own| own.capacity.mean);
+        let capacities_ah: Vec<f64> = [label.rated_ah].into_iter().chain(fitted_ah).chain(expected_ah).collect();
         let own = fit::label_cost(prior, rows, &capacities_ah)?;
         let others = Chemistry::ALL.iter().map(|(chemistry, _)| *chemistry).filter(|other| *other != label.chemistry);
         let costs = others.filter_map(|chemistry| {

@@ -6,6 +6,8 @@ use crate::cell::circuit::{BranchAt, soc_after, terminal_v};
 use crate::cell::model::tests::small_model;
 
 const CONFIG: OutlookConfig = OutlookConfig {
+    min_temperature_c: None,
+    max_temperature_c: None,
     min_voltage_v: None,
     max_voltage_v: None,
     max_discharge_a: None,

@@ -103,6 +103,9 @@ impl Monitor {
         snapshot.rebase(taken.unwrap_or(now).nanos().saturating_sub(snapshot.time.nanos()));
         let (buses, taken_at) = (std::mem::take(&mut snapshot.intake.buses), snapshot.time);
         snapshot.intake.buses = buses.restored(taken_at, now);
+        if taken.is_none() {
+            snapshot.sending.schedule.alarms.use_up(now);
+        }
         self.continue_from(snapshot.for_restart(), now, out);
         if taken.is_some() { Beginning::Restored } else { Beginning::RestoredAgeless }
     }
@@ -145,14 +148,15 @@ impl Stages {
         self.packs.retain(|pack| pack.fits(bank));
         self.sending.schedule = snapshot.sending.schedule.clone();
         if !is_continued {
-            self.sending.begin_freshness(now);
+            self.sending.schedule.begin_freshness(now);
             self.sending.restore_silence(&snapshot.sending, snapshot.time, now);
             let was_asleep = snapshot.asleep_since.is_some();
             let after_s = self.sleep.after_s.filter(|_| !was_asleep).unwrap_or(0.0);
-            self.sending.set_quiet_from(now.plus_secs(after_s));
+            self.sending.schedule.set_quiet_from(now.plus_secs(after_s));
         }
         self.sleep.since = snapshot.asleep_since;
-        self.restore_alarms(now, &snapshot.alarming.alarms, is_continued, out);
+        let stored = (!is_continued).then_some(snapshot.time);
+        self.restore_alarms(now, &snapshot.alarming.alarms, stored, out);
         if is_continued {
             self.alarming.resume(&snapshot.alarming);
             self.sending.resume(&snapshot.sending);
@@ -189,8 +193,16 @@ impl Stages {
                 estimation.bank.put(index, &estimator);
             }
         }
+        let is_of_other = |&own: &usize| estimation.is_of_other_model(own, &cells[own].model_check);
+        let is_changed = modelling.is_label() && estimation.bank.own_cells().iter().any(is_of_other);
         let stored = cells.iter().map(|cell| (cell.consumed, cell.trusted, cell.model_check));
         estimation.restore(stored, batch);
+        if is_changed {
+            // A resistance is stored relative to its model, so it means nothing with another label or prior.
+            let capacity = learning.state.learner.capacity(estimation.bank.own_cells()[0]);
+            let adoption = modelling.other_model_adoption(estimation.mean_estimate(), capacity);
+            estimation.adopt(&adoption, &mut learning.state.learner, &learning.config.capacity);
+        }
         let configured_a = learning.config.capacity.current_offset_std_a;
         estimation.bank.set_current_offset_std(learning.state.learner.current_offset().std_a(configured_a));
     }
@@ -233,15 +245,15 @@ impl Stages {
         self.publisher(now, out).publish_alarms();
     }
 
-    /// Restores the stored alarms. Alarms without a configured threshold end, and receivers on the bus are notified.
-    fn restore_alarms(&mut self, time: Timestamp, state: &AlarmSnapshot, is_continued: bool, out: &mut Outputs) {
+    /// Restores the alarms stored at `stored`; `None` = the same run continues. Alarms without a configured threshold end, and receivers on the bus are notified.
+    fn restore_alarms(&mut self, time: Timestamp, state: &AlarmSnapshot, stored: Option<Timestamp>, out: &mut Outputs) {
         self.alarming.state.knows_all_valid = false;
         let orphans = self.alarming.engine.restore(time, state);
-        if !is_continued {
+        if let Some(stored) = stored {
             self.sending.compare_first(time);
-            self.sending.skip_counters(time, &self.alarming.engine);
+            self.sending.skip_counters(stored, time, &self.alarming.engine);
         }
-        let has_changed = !is_continued || !orphans.is_empty();
+        let has_changed = stored.is_some() || !orphans.is_empty();
         for orphan in orphans {
             let StoredAlarm { rule, severity, cell, .. } = orphan;
             let (active, occurrences) = (orphan.is_raised(), orphan.occurrences());

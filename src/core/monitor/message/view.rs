@@ -5,6 +5,7 @@ use serde::{Deserialize, Serialize};
 use super::event::ModelState;
 use super::outputs::Validity;
 use crate::cell::Chemistry;
+use crate::health::UseRecord;
 use crate::monitor::stage::learning::moved::MovedSums;
 use crate::quantity::catalogue::{CellValues, PackValues};
 use crate::quantity::{CellIndex, Mode};
@@ -52,6 +53,9 @@ pub struct PackView {
     /// Charge and energy moved while the program ran with this pack; `None` in documents of earlier versions.
     #[serde(default)]
     pub moved: Option<MovedSums>,
+    /// How the pack was used while the program ran with it; `None` in documents of earlier versions.
+    #[serde(default)]
+    pub use_record: Option<UseRecord>,
     /// Values of the pack.
     #[serde(flatten)]
     pub values: PackValues,

@@ -235,10 +235,7 @@ impl Estimation {
 
     /// Mean SOC of the pack's own kind of cells, fraction; 0.5 if no such cell has an estimate.
     fn mean_soc(&self) -> f64 {
-        let own = self.bank.own_cells().iter();
-        let socs = own.filter_map(|&cell| self.bank.filtered_soc(cell)).map(|soc| soc.mean);
-        let (count, sum) = socs.fold((0.0, 0.0), |(count, sum), soc| (count + 1.0, sum + soc));
-        if count > 0.0 { sum / count } else { 0.5 }
+        self.mean_estimate().map_or(0.5, |soc| soc.mean)
     }
 
     /// Adopts another model. The cells keep their differences from the mean of the cells.
@@ -414,8 +411,21 @@ impl Estimation {
     /// Whether a cell belongs to a module and its stored `check` was made with another cell model than the present
     /// model.
     pub(crate) fn is_other_cell(&self, index: usize, check: &ModelCheck) -> bool {
-        let id = || model_id(self.bank.model(index), self.bank.config(index).initial.log_resistance_std);
-        !self.bank.is_own(index) && check.is_of_other(id())
+        !self.bank.is_own(index) && self.is_of_other_model(index, check)
+    }
+
+    /// Whether the stored `check` of a cell was made with another model than the present model.
+    pub(crate) fn is_of_other_model(&self, index: usize, check: &ModelCheck) -> bool {
+        check.is_of_other(model_id(self.bank.model(index), self.bank.config(index).initial.log_resistance_std))
+    }
+
+    /// Mean over the pack's own kind of cells of the SOC and of its variance; `None` if no such cell has an estimate.
+    pub(crate) fn mean_estimate(&self) -> Option<ScalarGaussian> {
+        let socs = self.bank.own_cells().iter().filter_map(|&cell| self.bank.filtered_soc(cell));
+        let (count, mean, variance) = socs.fold((0.0, 0.0, 0.0), |(count, mean, variance), soc| {
+            (count + 1.0, mean + soc.mean, variance + soc.variance)
+        });
+        (count > 0.0).then(|| ScalarGaussian { mean: mean / count, variance: variance / count })
     }
 
     /// The check of a cell's model, to be stored.

@@ -26,7 +26,7 @@ use crate::health::recharge::normalised_period;
 use crate::health::usable::usable_capacity;
 use crate::health::{
     CapacityUpdate, CellShare, HalfCycle, HealthConfig, Learner, Lesson, ModeChange, PackState, RecentLoad,
-    RechargeAlarm, RechargeConfig, RechargeTimer, TransitionDetector, pack,
+    RechargeAlarm, RechargeConfig, RechargeTimer, TransitionDetector, UseCounter, pack,
 };
 use crate::monitor::config::MonitorConfig;
 use crate::monitor::message::EventKind;
@@ -65,6 +65,8 @@ pub(crate) struct LearningState {
     pub(crate) load: RecentLoad,
     #[serde(default)]
     pub(crate) moved: MovedCounter,
+    #[serde(default)]
+    pub(crate) use_counter: UseCounter,
     pub(crate) pack: Option<PackState>,
 }
 
@@ -139,11 +141,14 @@ impl LearningState {
 
     /// The learned values only, without anything in progress and without timestamps.
     pub(crate) fn learned_only(&self) -> Self {
+        let mut use_counter = self.use_counter;
+        use_counter.interrupt();
         Self {
             learner: self.learner.learned_only(),
             recharge_period_s: self.recharge_period_s,
             normalised_recharge: self.normalised_recharge,
             moved: self.moved.interrupted(),
+            use_counter,
             ..Self::default()
         }
     }
@@ -158,6 +163,7 @@ impl LearningState {
         self.recharge.rebase(by_nanos);
         self.load.rebase(by_nanos);
         self.moved.rebase(by_nanos);
+        self.use_counter.rebase(by_nanos);
     }
 }
 
@@ -167,6 +173,7 @@ impl LearningState {
         self.recharge.check()?;
         self.load.check()?;
         self.moved.check()?;
+        self.use_counter.check()?;
         self.pack.iter().try_for_each(PackState::check)?;
         bounds::TIME_S.check_all("the recharge period", self.recharge_period_s)?;
         check_positive("the normalised recharge period", self.normalised_recharge)
@@ -246,6 +253,9 @@ impl Learning {
             self.finish_charge(!half_cycles.is_empty(), bank, to);
         }
         if !half_cycles.is_empty() {
+            let cells = half_cycles.iter().enumerate().filter(|(cell, _)| !is_doubtful[*cell]);
+            let cells = cells.map(|(cell, half_cycle)| (half_cycle, bank.model(cell).rated_capacity_ah));
+            self.state.use_counter.count_half_cycle(cells);
             self.state.learner.finish();
             self.state.learned_at = Some(to.now);
             self.lives.publish(was_life_known, is_measured, to);
@@ -462,7 +472,7 @@ impl Learning {
             lli: part(|losses| &losses.lithium),
             lam_ne: part(|losses| &losses.negative),
             lam_pe: part(|losses| &losses.positive),
-            model_state: None,
+            ..HealthFields::default()
         }
     }
 }

@@ -389,6 +389,14 @@ impl Modelling {
         Adoption { model, config, mean, with_capacity: true, is_learned: false }
     }
 
+    /// The configured model, for cells whose stored estimates were made with another model of a label. `soc`: mean of the
+    /// stored estimates. A stored `capacity` that is known better than the configured capacity is kept.
+    pub(crate) fn other_model_adoption(&self, soc: Option<ScalarGaussian>, capacity: ScalarGaussian) -> Adoption {
+        let adoption = self.label_adoption();
+        let with_capacity = capacity.variance > adoption.mean.capacity.variance;
+        Adoption { mean: AdoptedState { soc, ..adoption.mean }, with_capacity, ..adoption }
+    }
+
     /// Whether the latest fit returned to the previous model or to the label's model.
     pub(crate) fn has_returned(&self) -> bool {
         self.outcome == FitOutcome::Returned

@@ -8,15 +8,17 @@ use serde::{Deserialize, Serialize};
 pub(crate) mod alarm_queue;
 mod digest;
 pub(crate) mod j1939;
+mod schedule;
 
-use alarm_queue::{AlarmKey, AlarmQueue};
+use alarm_queue::AlarmKey;
 use j1939::J1939;
+pub use schedule::RESTART_FRESHNESS;
+use schedule::{Schedule, take_due};
 
 use crate::alarm::{Alarm, AlarmEngine, AlarmState, Rule};
 use crate::can::Frame;
 use crate::can::encode::{
-    AlarmFields, FRESHNESS_PERIOD_MS, HealthFields, LayoutMessage, OutputPlan, REPLY_DELAY_MS, ReplyFields,
-    SendCounters, StatusFields,
+    AlarmFields, HealthFields, LayoutMessage, OutputPlan, REPLY_DELAY_MS, ReplyFields, SendCounters, StatusFields,
 };
 use crate::can::j1939::Node;
 use crate::can::poll::{PollOutputs, PollProgress, Poller};
@@ -33,14 +35,6 @@ pub const MAX_TEST_S: f64 = 600.0;
 /// between are dropped. A small number suffices, because a sender of commands waits for each reply.
 const REPLY_BURST: i64 = 5;
 const REPLY_DELAY_NS: i64 = REPLY_DELAY_MS as i64 * 1_000_000;
-
-/// Number of freshness values skipped at a start. An earlier process may have sent this many frames after its state was
-/// stored: the driver stores the state before the first frame and after every half of these values. The value is so
-/// small that 300 starts a day do not overtake [`FRESHNESS_PER_S`].
-pub const RESTART_FRESHNESS: u64 = 1 << 16;
-/// At a start, the freshness is at least this value times the clock's time in seconds. The value exceeds the number of
-/// frames in a second.
-const FRESHNESS_PER_S: u64 = 256;
 
 /// The sending stage.
 #[derive(Debug)]
@@ -91,78 +85,10 @@ pub(crate) struct AlarmTest {
     end: Timestamp,
 }
 
-/// Due times of the cyclic work.
-#[derive(Debug, Clone, Default, Serialize, Deserialize)]
-pub(crate) struct Schedule {
-    housekeeping: Timestamp,
-    status: Timestamp,
-    health: Timestamp,
-    alarm: Timestamp,
-    /// Counts the alarm periods; selects the unknown alarm that is announced next.
-    alarm_turn: usize,
-    digest: Timestamp,
-    /// Counts the digests; selects the threshold in the next digest.
-    threshold_turn: usize,
-    /// Earliest time of the next reply.
-    reply: Timestamp,
-    pub(crate) alarms: AlarmQueue,
-    /// Counters of the frames' end-to-end protection.
-    counters: SendCounters,
-    /// Time of the next frame that announces the freshness for commands.
-    freshness: Timestamp,
-    /// Freshness of the last authenticated frame; all messages share one sequence.
-    sent_freshness: u64,
-    /// Whether cyclic frames are omitted, because the buses sleep.
-    #[serde(default)]
-    is_quiet: bool,
-    /// Time before which a sleep omits no frames. After a restart, the program first has to hear the silence itself.
-    #[serde(default)]
-    quiet_from: Timestamp,
-}
-
-impl Schedule {
-    /// Shifts stored times to another clock.
-    pub(crate) fn rebase(&mut self, by_nanos: i64) {
-        for due in self.dues() {
-            *due = due.plus_nanos(by_nanos);
-        }
-        self.reply = self.reply.plus_nanos(by_nanos);
-        self.alarms.rebase(by_nanos);
-    }
-
-    /// Due times of all cyclic work.
-    fn dues(&mut self) -> [&mut Timestamp; 6] {
-        let Self { housekeeping, status, health, alarm, digest, freshness, .. } = self;
-        [housekeeping, status, health, alarm, digest, freshness]
-    }
-
-    /// Applies the periods of a new configuration. A shorter period takes effect immediately.
-    fn reconfigure(&mut self, now: Timestamp, before: &OutputConfig, after: &OutputConfig) {
-        let periods_s =
-            |of: &OutputConfig| [of.status_period_s, of.health_period_s, of.alarm_period_s, of.digest_period_s];
-        let dues = [&mut self.status, &mut self.health, &mut self.alarm, &mut self.digest];
-        for (due, (before_s, after_s)) in dues.into_iter().zip(periods_s(before).into_iter().zip(periods_s(after))) {
-            if before_s != after_s {
-                *due = (*due).min(now.plus_secs(after_s));
-            }
-        }
-    }
-}
-
 /// Interfaces on which to send a frame: only `bus` if it is an output interface, otherwise all output interfaces.
 fn buses_of(output: &OutputConfig, bus: Option<BusIndex>) -> impl Iterator<Item = BusIndex> + '_ {
     let only = bus.filter(|bus| output.buses.contains(bus));
     output.buses.iter().copied().filter(move |other| only.is_none_or(|bus| bus == *other))
-}
-
-/// Whether work is due. If so, sets the next due time; missed periods are skipped.
-fn take_due(due: &mut Timestamp, now: Timestamp, period_s: f64) -> bool {
-    if now < *due {
-        return false;
-    }
-    let next = due.plus_secs(period_s);
-    *due = if next > now { next } else { now.plus_secs(period_s) };
-    true
 }
 
 impl Sending {
@@ -256,39 +182,35 @@ impl Sending {
 
     /// Omits cyclic frames while the buses sleep, unless they are configured.
     pub(crate) fn set_asleep(&mut self, now: Timestamp, is_asleep: bool) {
-        let is_asleep = is_asleep && now >= self.schedule.quiet_from;
-        self.schedule.is_quiet = is_asleep && self.config.as_ref().is_none_or(|config| !config.while_asleep);
+        // A poller receives every frame, so it knows whether a bus sleeps. Between two polls, the inputs are silent on an
+        // awake bus, too.
+        let is_asleep = is_asleep && self.poller.as_ref().is_none_or(|poller| poller.is_bus_asleep(now));
+        let is_omitted = self.config.as_ref().is_none_or(|config| !config.while_asleep);
+        self.schedule.is_quiet = is_asleep && is_omitted && now >= self.schedule.quiet_from;
     }
 
-    /// After a restart: a sleep that the program has not seen yet omits no frames before `time`.
-    pub(crate) fn set_quiet_from(&mut self, time: Timestamp) {
-        self.schedule.quiet_from = time;
+    /// Ends the silence of a sleep that began at `since`.
+    pub(crate) fn wake(&mut self, now: Timestamp, since: Timestamp) {
+        self.restart(now);
+        if let Some(j1939) = &mut self.j1939 {
+            j1939.node.resume_cyclic(now, since);
+        }
+    }
+
+    /// Whether the health frame contains energy, time or power.
+    pub(crate) fn has_outlook(&self) -> bool {
+        self.config.as_ref().is_some_and(|config| config.plan.has_outlook())
     }
 
     /// Makes all cyclic work due now. Called after a start, a sleep, and a gap.
     pub(crate) fn restart(&mut self, now: Timestamp) {
         self.is_rescheduled = true;
-        self.schedule.dues().into_iter().for_each(|due| *due = now);
-        self.schedule.reply = self.schedule.reply.min(now);
-        self.schedule.alarms.restart(now);
-    }
-
-    /// Starts the freshness of authenticated frames above all values that an earlier process can have sent, because
-    /// receivers accept each value only once. If the stored state was lost, the value follows from the clock.
-    pub(crate) fn begin_freshness(&mut self, now: Timestamp) {
-        let by_clock = u64::try_from(now.nanos() / 1_000_000_000).unwrap_or(0).saturating_mul(FRESHNESS_PER_S);
-        let sent = &mut self.schedule.sent_freshness;
-        *sent = sent.saturating_add(RESTART_FRESHNESS).max(by_clock);
-    }
-
-    /// Freshness of the last authenticated frame.
-    pub(crate) fn sent_freshness(&self) -> u64 {
-        self.schedule.sent_freshness
+        self.schedule.restart(now);
     }
 
     /// Skips the counters of all frames that an earlier process sent after its state was stored, or would have sent by
     /// `now`. To receivers, the frames of the downtime then look lost, and no counter repeats.
-    pub(crate) fn skip_counters(&mut self, now: Timestamp, engine: &AlarmEngine) {
+    pub(crate) fn skip_counters(&mut self, stored: Timestamp, now: Timestamp, engine: &AlarmEngine) {
         let Some(config) = &self.config else { return };
         let Schedule { status, health, alarm, digest, alarms, counters, .. } = &mut self.schedule;
         let periods = |due: Timestamp, period_s: f64| {
@@ -299,7 +221,7 @@ impl Sending {
         let pages = |count: usize| u64::try_from(count).unwrap_or(0);
         // The queue still holds the alarms that the earlier process announced as unknown.
         let unknown = u64::from(alarms.has_unknown()) * periods(*alarm, config.alarm_period_s);
-        alarms.limit(now, config.alarm_period_s);
+        alarms.limit(stored, now, config.alarm_period_s);
         for (message, frames) in [
             (LayoutMessage::Status, periods(*status, config.status_period_s)),
             (
@@ -341,22 +263,13 @@ impl Sending {
 
     /// Whether the status, health and alarm frames and the digest are due; `None` without `[output]`.
     pub(crate) fn take_frames_due(&mut self, now: Timestamp) -> Option<[bool; 4]> {
-        let (config, schedule) = (self.config.as_ref()?, &mut self.schedule);
-        let due = [
-            take_due(&mut schedule.status, now, config.status_period_s),
-            take_due(&mut schedule.health, now, config.health_period_s),
-            take_due(&mut schedule.alarm, now, config.alarm_period_s),
-            take_due(&mut schedule.digest, now, config.digest_period_s),
-        ];
-        Some(due.map(|is_due| is_due && !self.schedule.is_quiet))
+        Some(self.schedule.take_frames_due(now, self.config.as_ref()?))
     }
 
     /// Whether the frame that announces the freshness for commands is due.
     pub(crate) fn take_freshness_due(&mut self, now: Timestamp) -> bool {
         let is_sent = |config: &OutputConfig| config.plan.authentication(LayoutMessage::Freshness).is_some();
-        let due = &mut self.schedule.freshness;
-        let period_s = f64::from(FRESHNESS_PERIOD_MS) / 1000.0;
-        self.config.as_ref().is_some_and(is_sent) && take_due(due, now, period_s) && !self.schedule.is_quiet
+        self.config.as_ref().is_some_and(is_sent) && self.schedule.take_freshness_due(now)
     }
 
     /// Announces the freshness that commands may use next. `bus`: interface on which commands are received.

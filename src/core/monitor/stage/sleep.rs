@@ -42,6 +42,11 @@ impl BusSleep {
         Self { after_s: config.asleep_after_s.map(|after_s| after_s.max(oldest_s)), since: None }
     }
 
+    /// Whether the buses count as asleep.
+    pub(crate) fn is_asleep(&self) -> bool {
+        self.since.is_some() && self.after_s.is_some()
+    }
+
     /// Applies the time-out of a new configuration; a sleep in progress continues.
     pub(crate) fn reconfigure(&mut self, config: &MonitorConfig) {
         self.after_s = Self::new(config).after_s;

@@ -5,11 +5,13 @@ use super::Stages;
 use crate::cell::{ModelBands, arrhenius};
 use crate::filter::{ScalarGaussian, square};
 use crate::health::outlook::{CellNow, Outlook, Structure, energy_health, of_pack};
+use crate::quantity::CellIndex;
+use crate::quantity::catalogue::{PackValues, Quantity};
 use crate::sample::VoltageSource;
 
 impl Stages {
     /// Energy, time and power of the pack; `None` unless the state of every cell is known.
-    pub(crate) fn outlook(&self) -> Option<Outlook> {
+    fn outlook(&self) -> Option<Outlook> {
         let Self { sampling, estimation, learning, .. } = self;
         let pack = learning.state.pack.as_ref()?;
         let cells: Vec<_> = (0..estimation.cells()).map(|index| self.cell_state(index)).collect::<Option<_>>()?;
@@ -21,6 +23,27 @@ impl Stages {
         let (soc, capacity_ah) = (pack.soc, pack.capacity_ah);
         let structure = Structure { series_per_state, strings: sampler.strings(), soc, capacity_ah };
         of_pack(config, (&learning.state.load, learning.mode()), &cells, &structure)
+    }
+
+    /// Sets the values of energy, time and power. Returns the cells that limit the power of a discharge and of a charge.
+    pub(crate) fn set_outlook(&self, values: &mut PackValues) -> Option<[CellIndex; 2]> {
+        let outlook = self.outlook();
+        use Quantity as Q;
+        let mut set = |quantity, value: Option<ScalarGaussian>| values.set(quantity, value);
+        set(Q::RemainingEnergy, outlook.map(|it| it.remaining_wh));
+        set(Q::EnergyToFull, outlook.map(|it| it.to_full_wh));
+        set(Q::TimeToEmpty, outlook.and_then(|it| it.to_empty_s));
+        set(Q::TimeToFull, outlook.and_then(|it| it.to_full_s));
+        set(Q::TimeToTarget, outlook.and_then(|it| it.to_target_s));
+        let powers = [
+            [Q::DischargePower2s, Q::DischargePower10s, Q::DischargePower30s],
+            [Q::ChargePower2s, Q::ChargePower10s, Q::ChargePower30s],
+        ];
+        for (k, [discharge, charge]) in (0..3).map(|k| (k, powers.map(|times| times[k]))) {
+            set(discharge, outlook.map(|it| it.discharge_w[k]));
+            set(charge, outlook.map(|it| it.charge_w[k]));
+        }
+        outlook.map(|it| it.limiting_cells)
     }
 
     /// State of health by energy of the cell with the least capacity; `None` until every capacity has been learned.

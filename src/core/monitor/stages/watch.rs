@@ -190,8 +190,8 @@ impl Stages {
             let std = (highest.variance + lowest.variance).sqrt();
             Observation::new(Some(highest.mean - lowest.mean)).with_std(std).of_part(!is_whole)
         });
-        let hottest = self.sampling.sampler.hottest_c(now);
-        let hottest = hottest.map(|(hottest_c, is_whole)| Observation::new(Some(hottest_c)).of_part(!is_whole));
+        let hottest = self.sampling.sampler.temperature_range_c(now);
+        let hottest = hottest.map(|it| Observation::new(Some(it.highest)).of_part(!it.is_whole));
         let disagreement = self.disagreement(now);
         let mut publisher = self.publisher(now, out);
         publisher.observe(Rule::SocLow, None, soc_low.unwrap_or_default());

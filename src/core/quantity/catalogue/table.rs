@@ -6,7 +6,7 @@ use Quantity as Q;
 use QuantityRow as Row;
 
 /// The catalogue, in the order of [`Quantity`].
-pub static TABLE: [QuantityRow; 35] = [
+pub static TABLE: [QuantityRow; 38] = [
     Row::estimate(Q::Soc, ("soc", "soc_std"), Unit::Level, "soc")
         .pack("State of charge of the limiting cell", ("SOC", "SoC"), Standard("StateOfCharge.Current"))
         .cell("State of charge", Some("cell_soc"), Overlay("Cells.StateOfCharge")),
@@ -222,5 +222,20 @@ pub static TABLE: [QuantityRow; 35] = [
         "Power that can be charged for 30 s within the limits of every cell",
         ("charge_power_30s", "Charge Power 30 s"),
         Overlay("Power.Charge30s"),
+    ),
+    Row::number(Q::LimitEvents, "limit_events", Unit::Count, "limit_events").pack(
+        "Events in which a temperature, a cell voltage or the current was beyond its limit",
+        ("limit_events", "Events beyond Limits"),
+        Overlay("Use.LimitEvents"),
+    ),
+    Row::number(Q::FastCharges, "fast_charges", Unit::Count, "fast_charges").pack(
+        "Charges with a mean C-rate above 1 C",
+        ("fast_charges", "Fast Charges"),
+        Overlay("Use.FastCharges"),
+    ),
+    Row::number(Q::HighSocTime, "high_soc_time_s", Unit::Seconds, "high_soc_time").pack(
+        "Time at rest with a state of charge above 80 %",
+        ("high_soc_time", "Rest at High SoC"),
+        Overlay("Use.HighSocTime"),
     ),
 ];

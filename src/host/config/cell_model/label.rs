@@ -13,22 +13,25 @@ pub fn of_label(label: &Label) -> Option<SourcedModel> {
         measured: MeasuredRange::default(),
         provenance: toml::Table::new(),
         learned: None,
+        fleet: None,
     };
     label.model().map(|model| SourcedModel { model, source })
 }
 
 /// Returns the model with which a vehicle of a fleet starts; `None` = the voltages are not plausible for the chemistry.
-pub fn of_fleet(prior: &FleetPrior) -> Option<SourcedModel> {
+pub fn of_fleet(prior: FleetPrior) -> Option<SourcedModel> {
     let SourcedModel { source, .. } = of_label(&prior.label)?;
     let origin = format!("learned by {} other vehicles with cells of this label", prior.vehicles);
     let provenance = toml::Table::from_iter([("source".to_owned(), origin.into())]);
-    Some(SourcedModel { model: prior.cell_model()?, source: ModelSource { provenance, ..source } })
+    let model = prior.cell_model()?;
+    Some(SourcedModel { model, source: ModelSource { provenance, fleet: Some(Box::new(prior)), ..source } })
 }
 
 /// Returns the present model of a pack that learns its model on board; `None` = the pack's model comes from a file.
 pub fn of_view(view: &ModelView<'_>) -> Option<SourcedModel> {
     let label = view.label?;
-    let SourcedModel { model: prior, source } = view.fleet.map_or_else(|| of_label(&label), of_fleet)?;
+    let SourcedModel { model: prior, source } =
+        view.fleet.map_or_else(|| of_label(&label), |fleet| of_fleet(fleet.clone()))?;
     let learned = LearnedFrom {
         seen: Coverage::of_rows(view.notebook.map_or(&[], |notebook| notebook.rows())),
         residual_v: view.own.map(|own| own.residual_v),

@@ -72,6 +72,7 @@ pub(crate) fn load_with(path: &Path, read: ReadFile<'_>, faults: &Faults) -> Opt
         measured: measured.map_or_else(MeasuredRange::default, |keys| keys.range()),
         provenance: provenance(path, read),
         learned: None,
+        fleet: None,
     };
     let model = CellModel {
         name: head.name,

@@ -3,7 +3,7 @@
 use toml::{Table, Value};
 
 use crate::cell::model_bands::CURVE_C;
-use crate::cell::{CellModel, Chemistry, Coverage, ModelBands};
+use crate::cell::{CellModel, Chemistry, Coverage, FleetPrior, ModelBands};
 use crate::monitor::{ModelChange, ModelState};
 
 /// Largest rounding error of the ends of a measured range, in the unit of the range.
@@ -44,6 +44,8 @@ pub struct ModelSource {
     pub provenance: Table,
     /// For a model that is learned on board: the label's model, and the data behind the learned values.
     pub learned: Option<LearnedFrom>,
+    /// For a model of `pack.prior`: the prior.
+    pub fleet: Option<Box<FleetPrior>>,
 }
 
 /// The data behind a learned model.

@@ -51,7 +51,7 @@ pub(crate) fn own_model(
     check_label(&pack.place, pack.chemistry, pack.rated_capacity_ah)?;
     let label = label(pack)?;
     if pack.prior.is_some() {
-        return cell_model::of_fleet(&fleet_prior(path, pack, read)?);
+        return cell_model::of_fleet(fleet_prior(path, pack, read)?);
     }
     let model = cell_model::of_label(&label);
     if model.is_none() {
@@ -69,7 +69,7 @@ pub(crate) fn own_model(
 }
 
 /// What other vehicles have learned about the pack's own cells, from the file `pack.prior`.
-pub(crate) fn fleet_prior(path: &Path, pack: &Pack, read: ReadFile<'_>) -> Option<FleetPrior> {
+fn fleet_prior(path: &Path, pack: &Pack, read: ReadFile<'_>) -> Option<FleetPrior> {
     let (named, label) = (pack.prior.as_ref()?, label(pack)?);
     let file = beside(path, named);
     let parsed = read(&file).map_err(|error| error.to_string()).and_then(|bytes| {
@@ -83,9 +83,7 @@ pub(crate) fn fleet_prior(path: &Path, pack: &Pack, read: ReadFile<'_>) -> Optio
     });
     match parsed {
         Ok(prior) if prior.label == label => return Some(prior),
-        Ok(prior) => {
-            pack.place.fault("prior", format!("is for {}, must be for the cells of [pack]: {label}", prior.label))
-        }
+        Ok(prior) => pack.place.fault("prior", format!("was made for {}, but [pack] describes {label}", prior.label)),
         Err(error) => {
             let what = format!("must be a file of `packwatch fleet prior`: {}: {error}", file.display());
             pack.place.fault("prior", what);

@@ -195,6 +195,12 @@ fn health(raw: &RawTables, model: Option<&CellModel>) {
             estimator.place.fault("capacity_state", format!("must be \"{needed}\" with capacity.method = \"{key}\""));
         }
     }
+    if let Some(outlook) = &raw.outlook
+        && let (Some(min_c), Some(max_c)) = (outlook.min_temperature_c, outlook.max_temperature_c)
+        && max_c <= min_c
+    {
+        outlook.place.fault("max_temperature_c", format!("must be above min_temperature_c = {min_c}"));
+    }
     // If the model's own range is invalid, only the model's fault is reported.
     let has_range = |model: &&CellModel| model.voltage_min_v < model.voltage_max_v;
     if let (Some(outlook), Some(model)) = (&raw.outlook, model.filter(has_range)) {
@@ -206,7 +212,7 @@ fn health(raw: &RawTables, model: Option<&CellModel>) {
             outlook.place.fault("min_voltage_v", &what);
         }
         if outlook.max_voltage_v.is_some_and(|max_v| max_v <= min_v || max_v > high_v) {
-            outlook.place.fault("max_voltage_v", format!("must be above {min_v}, the lowest voltage, to {high_v}"));
+            outlook.place.fault("max_voltage_v", format!("must be above min_voltage_v = {min_v} and at most {high_v}"));
         }
     }
     if let (Some(usable), Some(model)) = (&raw.usable, model)

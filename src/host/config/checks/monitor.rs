@@ -83,7 +83,7 @@ pub(crate) fn monitor(
         model,
         modules,
         label: cells::label(pack).filter(|_| pack.learn_model),
-        fleet: cells::fleet_prior(path, pack, read).filter(|_| pack.learn_model),
+        fleet: None,
         is_balanced: pack.balancing,
         balancing: raw.balancing.as_ref().map(|keys| BalancingConfig {
             bleed_a: keys.bleed_a / f64::from(pack.strings),

@@ -81,6 +81,10 @@ pub(crate) fn output(
     let database = layout(base, &settings).map_err(|refused| refused.iter().for_each(refuse)).ok()?;
     let missing = |error: &String| keys.place.fault("dbc", error);
     let plan = OutputPlan::new(&database).map_err(|all| all.0.iter().for_each(missing)).ok()?;
+    if keys.outlook && !plan.has_outlook() {
+        keys.place.fault("outlook", "must be false: the DBC has no signal of energy, time or power");
+    }
+    let plan = if keys.outlook { plan } else { plan.without_outlook() };
     let buses = buses(raw, keys);
     check_ids(&frames, &plan, &buses, found);
     for sent in plan.messages().filter(|sent| sent.format != FrameFormat::Classic) {

@@ -81,7 +81,9 @@ fn read_config<T>(
     plausible::ranges(&raw, &found, ranged.as_ref());
     let monitor = monitor::monitor(&raw, &found, inputs_whole, model, modules, path, read);
     let interfaces = raw.interfaces.iter().map(|i| InterfaceConfig { name: i.name.clone(), fd: i.fd }).collect();
-    let (monitor, output_layout) = monitor?;
+    let (mut monitor, output_layout) = monitor?;
+    let fleet = model_source.as_ref().and_then(|source| source.fleet.as_deref());
+    monitor.fleet = monitor.label.and(fleet.cloned());
     let store = raw.store.as_ref()?;
     let store =
         StoreConfig { checkpoint_s: store.checkpoint_s, max_rows: store.max_rows, keep_years: store.keep_years };

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use tempfile::TempDir;
 use tokio::io::AsyncRead;
 
+use super::super::MAX_CONNECTIONS;
 use super::super::protocol::{CommandOutcome, contents};
 use super::*;
 use crate::monitor::Command;
@@ -143,7 +144,7 @@ fn request_displaces_silent_clients() {
         let (_server, path) = serve(&folder).await;
         let mut silent = Vec::new();
         // All connections of this process count as one client.
-        for _ in 0..MAX_PER_PROCESS {
+        for _ in 0..super::SLOTS.per_client {
             silent.push(connect(&path).await);
         }
         let mut next = connect(&path).await;

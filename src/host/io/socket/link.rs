@@ -86,6 +86,16 @@ impl LinkOutput {
     }
 }
 
+#[cfg(test)]
+impl LinkOutput {
+    /// A sending end without a link, and a function that takes the next queued frame.
+    pub(crate) fn captured() -> (Self, impl FnMut() -> Option<Frame>) {
+        let (queue, mut outgoing) = mpsc::channel(SEND_QUEUE);
+        let output = Self { queue, unsent: Arc::default(), health: Arc::default() };
+        (output, move || outgoing.try_recv().ok().map(|queued: QueuedFrame| queued.frame))
+    }
+}
+
 /// Why the link stops using a socket.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum ServiceEnd {

@@ -90,15 +90,15 @@ fn stream_sends_a_line_per_document() {
 }
 
 #[test]
-fn clients_beyond_limit_are_rejected_and_counted() {
+fn clients_beyond_limit_of_process_are_rejected_and_counted() {
     let folder = tempfile::tempdir().unwrap();
     let (server, path) = serve(&folder, PATIENT);
-    let seated: Vec<UnixStream> = (0..MAX_CLIENTS).map(|_| connect(&stream_path(&path))).collect();
-    until("full", || server.clients().connected == MAX_CLIENTS as u64);
+    let seated: Vec<UnixStream> = (0..SLOTS.per_client).map(|_| connect(&stream_path(&path))).collect();
+    until("full", || server.clients().connected == SLOTS.per_client as u64);
     for _ in 0..136 {
         assert_eq!(rest(connect(&path)), b"");
     }
-    assert_eq!((server.clients().served, server.clients().refused), (MAX_CLIENTS as u64, 136));
+    assert_eq!((server.clients().served, server.clients().refused), (SLOTS.per_client as u64, 136));
     offer(&server, 1, 7);
     for mut stream in seated {
         assert_ne!(stream.read(&mut [0; 16]).unwrap(), 0, "the server must serve an admitted client");

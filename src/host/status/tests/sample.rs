@@ -7,6 +7,7 @@ use crate::cell_faults::{CellFault, CellFaultKind};
 use crate::config::VehicleIdentity;
 use crate::control::protocol::UnknownAlarms;
 use crate::filter::ScalarGaussian;
+use crate::health::UseRecord;
 use crate::io::socket::{LinkCounts, LinkState};
 use crate::monitor::{
     AlarmCounts, BusStatistics, CellView, LearningCounts, ModelState, MovedSums, PackView, Statistics, Validity,
@@ -145,6 +146,7 @@ fn pack(cells: u16) -> PackView {
         (Quantity::RemainingEnergy, 541.0, Some(23.0)),
         (Quantity::TimeToEmpty, 4321.0, Some(600.0)),
         (Quantity::DischargePower10s, 8210.0, Some(410.0)),
+        (Quantity::FastCharges, 12.0, None),
     ] {
         values.set(quantity, Some(Estimate { mean, std }));
     }
@@ -163,6 +165,7 @@ fn pack(cells: u16) -> PackView {
             charged_wh: 424_000.0,
             discharged_wh: 406_000.0,
         }),
+        use_record: Some(UseRecord::default()),
         values: with_life(values, 0.061, 412.3),
     }
 }

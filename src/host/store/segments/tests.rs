@@ -58,6 +58,7 @@ fn changed_row_breaks_its_segment() {
     assert_eq!(broken("SELECT 1"), None);
     for (change, segment) in [
         ("UPDATE capacity SET capacity_ah = 9 WHERE seq = 53", 6),
+        ("UPDATE capacity SET code = code + 1 WHERE seq = 53", 6),
         ("UPDATE half_cycle SET charge_ah = 9 WHERE seq = 51", 6),
         ("UPDATE alarm SET acknowledged = 1 WHERE seq = 20", 2),
         ("DELETE FROM capacity WHERE seq = 8", 1),
@@ -77,7 +78,7 @@ fn changed_row_breaks_its_segment() {
     let cut = "DELETE FROM segment WHERE id = 20; DELETE FROM capacity WHERE seq > 190; DELETE FROM alarm WHERE seq > 190; \
                DELETE FROM half_cycle WHERE seq > 190";
     assert_eq!(broken(cut), Some((20, [191, 191])));
-    let added = "INSERT INTO half_cycle (seq, moment) VALUES (201, 40)";
+    let added = "INSERT INTO half_cycle (seq, code, moment) VALUES (201, 0, 40)";
     assert_eq!(broken(added), Some((21, [201, 201])));
 }
 

@@ -18,8 +18,8 @@ struct FlipCounts {
     set_aside: usize,
     /// Number of flips after which the newest state was not found.
     older: usize,
-    /// Flips after which no undamaged state was found, nothing could be written, or the written state or the history's
-    /// rows were missing at the next start.
+    /// Flips after which an altered row was shown, no undamaged state was found, nothing could be written, or the written
+    /// state or the history's rows were missing at the next start.
     failed: Vec<(&'static str, usize, String)>,
 }
 
@@ -31,6 +31,8 @@ struct Reference {
     now: Stamp,
     /// The state that is written after each flip.
     next: StateDocument,
+    /// The rows of the history.
+    entries: Vec<HistoryEntry>,
 }
 
 /// A folder in memory if the system has one, because a flip needs several syncs.
@@ -67,7 +69,9 @@ impl Reference {
         // Writes the next state and reads it back. The test later compares it with a state that was read from a file.
         StateFiles::open(&state).0.write(document(2, 100, 1_900_000_000)).unwrap();
         let next = stored(&state);
-        Self { files, states, now: document(2, 200, 1_900_000_100).stamp, next }
+        let entries = HistoryReader::open(&state).unwrap().entries(&HistoryQuery::default()).unwrap();
+        assert!(entries.len() > 3, "{entries:?}");
+        Self { files, entries, states, now: document(2, 200, 1_900_000_100).stamp, next }
     }
 
     fn flip(&self, name: &'static str, bit: usize, place: &Path, counts: &mut FlipCounts) {
@@ -79,6 +83,9 @@ impl Reference {
             std::fs::write(place.join(file), &bytes).unwrap();
         }
         counts.flips += 1;
+        if let Some(row) = self.altered_row(place) {
+            counts.failed.push((name, bit, format!("shown as good: {row:?}")));
+        }
         if let Err(why) = self.start(name, place, counts) {
             counts.failed.push((name, bit, why));
         }
@@ -86,6 +93,12 @@ impl Reference {
         for file in std::fs::read_dir(place).unwrap() {
             std::fs::remove_file(file.unwrap().path()).unwrap();
         }
+    }
+
+    /// A row that the history shows, but that was not written.
+    fn altered_row(&self, place: &Path) -> Option<HistoryEntry> {
+        let shown = HistoryReader::open(place).ok()?.entries(&HistoryQuery::default()).ok()?;
+        shown.into_iter().find(|entry| !self.entries.contains(entry))
     }
 
     /// Starts with the damaged store, writes a state, and starts again.

@@ -7,7 +7,7 @@ use std::borrow::Cow;
 use std::fmt::Write as _;
 use std::sync::LazyLock;
 
-use super::rows::{AlarmRow, EstimateRow, HalfCycleRow};
+use super::rows::{AlarmRow, EstimateRow, HalfCycleRow, UseRow};
 use crate::fleet::vehicle::VehicleRecord;
 
 use crate::cell::LossModes;
@@ -200,6 +200,13 @@ pub(super) const ALARMS: &[Column<AlarmRow>] = &columns! { AlarmRow;
     "acknowledged" Flag "", "whether the alarm was acknowledged", |row| FieldValue::Flag(row.alarm.flag("acknowledged"));
 };
 
+/// Columns of `use_record`.
+pub(super) const USE_RECORD: &[Column<UseRow>] = &columns! { UseRow;
+    "log" Word "", "name of the log and of its folder", |row| text(&row.log);
+    "counter" Word "", "path of the number in the record of use, with its unit", |row| text(&row.counter);
+    "value" Real "unit", "number at the end of the log", |row| real(row.value);
+};
+
 /// Columns of `vehicles`, which [`merge`](super::merge) writes.
 pub(super) const VEHICLES: &[Column<VehicleRecord>] = &columns! { VehicleRecord;
     "log" Word "", "name of the vehicle, as in the other tables", |row| text(&row.line.vehicle);
@@ -274,6 +281,11 @@ pub fn reference() -> String {
         &HALF_CYCLES,
     );
     page += &section("alarms", "A change of an alarm.", ALARMS);
+    page += &section(
+        "use_record",
+        "A known number of the record of use (`use_record` in the status document) of the pack that is connected at the end of the log.",
+        USE_RECORD,
+    );
     page += &section("vehicles", "A vehicle of a fleet, written by `packwatch fleet merge`.", VEHICLES);
     page
 }

@@ -2,10 +2,12 @@
 
 use std::sync::Arc;
 
+use serde_json::Value;
+
 use crate::alarm::Rule;
 use crate::cell::LossModes;
 use crate::fields::Fields;
-use crate::health::RemainingLife;
+use crate::health::{RemainingLife, UseRecord};
 use crate::monitor::Estimate;
 use crate::quantity::Timestamp;
 
@@ -40,4 +42,34 @@ pub(super) struct AlarmRow {
     pub(super) rule: Rule,
     /// Values of the event `Alarm`.
     pub(super) alarm: Fields,
+}
+
+/// A number of the record of use.
+pub(super) struct UseRow {
+    pub(super) log: Arc<str>,
+    /// Path of the number in the record, such as `rest.above_80_s`.
+    pub(super) counter: String,
+    pub(super) value: f64,
+}
+
+impl UseRow {
+    /// Returns a row for each known number of a record.
+    pub(super) fn of_record(log: &Arc<str>, record: &UseRecord) -> Result<Vec<Self>, serde_json::Error> {
+        let mut rows = Vec::new();
+        let mut waiting = vec![(String::new(), serde_json::to_value(record)?)];
+        while let Some((counter, value)) = waiting.pop() {
+            let path = |name: &str| if counter.is_empty() { name.to_owned() } else { format!("{counter}.{name}") };
+            match &value {
+                Value::Object(members) => {
+                    waiting.extend(members.iter().rev().map(|(name, value)| (path(name), value.clone())))
+                }
+                Value::Array(items) => {
+                    let items = items.iter().enumerate().rev();
+                    waiting.extend(items.map(|(index, value)| (path(&index.to_string()), value.clone())));
+                }
+                value => rows.extend(value.as_f64().map(|value| Self { log: log.clone(), counter, value })),
+            }
+        }
+        Ok(rows)
+    }
 }

@@ -5,7 +5,7 @@ use super::*;
 use crate::alarm::{AlarmState, Change, Rule, Severity};
 use crate::cell::{Chemistry, Label};
 use crate::cell_faults::{CellFaultDetector, UnknownImbalance};
-use crate::health::InsufficientData;
+use crate::health::{InsufficientData, UseRecord};
 use crate::monitor::{Estimate, Event, EventKind, MeasuredValues};
 use crate::quantity::catalogue::{Quantity, RecordedValues};
 use crate::quantity::{CellIndex, Mode, Timestamp};
@@ -132,7 +132,9 @@ fn page_of_a_long_life_stays_below_five_megabytes() {
     let diagnosis = CellFaultDetector::new(96);
     let imbalance = Some(Err(UnknownImbalance::NotCompared));
     let title = "pack".into();
-    let context = PageContext { title, model, diagnosis: Some(&diagnosis), imbalance, ..PageContext::default() };
+    let use_record = Some(UseRecord::default());
+    let diagnosis = Some(&diagnosis);
+    let context = PageContext { title, model, diagnosis, imbalance, use_record, ..PageContext::default() };
     let page = page(&life(), &context);
     println!("{} bytes", page.len());
     assert!(page.len() < 5_000_000, "{} bytes", page.len());
@@ -159,7 +161,7 @@ fn menu_follows_the_order_of_the_page() {
     let is_title = |tag: &&str| tag.starts_with("h2") || tag.starts_with("p class=\"none\" id");
     let titles = page.split('<').filter(is_title).filter_map(|rest| rest.split("id=\"").nth(1)?.split('"').next());
     assert_eq!(menu, titles.collect::<Vec<_>>());
-    assert!(menu.len() == SECTIONS.len() + 4 && menu.contains(&"alarms"), "{menu:?}");
+    assert!(menu.len() == SECTIONS.len() + 5 && menu.contains(&"alarms"), "{menu:?}");
 }
 
 #[test]

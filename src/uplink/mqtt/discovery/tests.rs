@@ -6,6 +6,7 @@ use super::*;
 
 /// Device classes of Home Assistant that the messages use, and the units that Home Assistant accepts for each class.
 const CLASSES: &[(&str, &[&str])] = &[
+    ("energy", &["Wh", "kWh"]),
     ("energy_storage", &["Wh", "kWh"]),
     ("battery", &["%"]),
     ("current", &["A", "mA"]),
@@ -44,7 +45,8 @@ fn messages_match_home_assistant_rules() {
                 let (_, units) =
                     CLASSES.iter().find(|(known, _)| *known == class).unwrap_or_else(|| panic!("{topic}: {class}"));
                 assert!(units.contains(&config["unit_of_measurement"].as_str().unwrap()), "{topic}");
-                assert_eq!(config["state_class"], "measurement", "{topic}");
+                let state = if class == "energy" { "total_increasing" } else { "measurement" };
+                assert_eq!(config["state_class"], state, "{topic}");
             }
             ("sensor", None) => {}
             other => panic!("{topic}: {other:?}"),

@@ -4,6 +4,7 @@ use super::*;
 use crate::can::e2e::Profile;
 use crate::can::encode::{E2eSetting, LayoutBase, LayoutSettings, MessageSettings, default_database, layout};
 use crate::quantity::Fault;
+use crate::quantity::catalogue::Estimate;
 
 const TEXT: &str = include_str!("../../../../../config/packwatch.dbc");
 
@@ -68,7 +69,7 @@ fn shipped_dbc_has_all_signals_and_cycle_times() {
     let times_ms: Vec<_> = plan.messages().map(|sent| sent.cycle_time_ms).collect();
     assert_eq!(times_ms, [Some(100), Some(1000), Some(1000), Some(1000), None]);
     assert_eq!(plan.digest_pages(), 4);
-    assert_eq!(plan.health_pages(), 5);
+    assert_eq!(plan.health_pages(), 13);
 }
 
 #[test]
@@ -103,7 +104,7 @@ fn status_decodes_within_half_a_bit() {
 }
 
 /// For each field of the health frame: its page, its name, a value in internal units, and the decoded value.
-const HEALTH_VALUES: [(usize, &str, f64, f64); 18] = [
+const HEALTH_VALUES: [(usize, &str, f64, f64); 36] = [
     (0, "Capacity", 2.6, 2.6),
     (0, "CapacityStd", 0.0213, 0.0213),
     (0, "Soh", 0.871, 87.1),
@@ -122,9 +123,36 @@ const HEALTH_VALUES: [(usize, &str, f64, f64); 18] = [
     (4, "LamPe", 0.0391, 4.0),
     (4, "LamPeStd", 0.0512, 5.0),
     (1, "ModelState", 2.0, 2.0),
+    (5, "RemainingEnergy", 41_234.0, 41_234.0),
+    (5, "RemainingEnergyStd", 1_803.0, 1_803.0),
+    (6, "EnergyToFull", 20_000.0, 20_000.0),
+    (6, "EnergyToFullStd", 950.0, 950.0),
+    (7, "TimeToEmpty", 5_432.0, 5_430.0),
+    (8, "TimeToEmptyStd", 611.0, 610.0),
+    (7, "TimeToFull", 7_200.0, 7_200.0),
+    (8, "TimeToFullStd", 305.0, 310.0),
+    (7, "TimeToTarget", 3_333.0, 3_330.0),
+    (8, "TimeToTargetStd", 99.0, 100.0),
+    (11, "DischargePower2s", 180_004.0, 180_000.0),
+    (9, "DischargePower10s", 150_000.0, 150_000.0),
+    (9, "DischargePower10sStd", 4_096.0, 4_100.0),
+    (11, "DischargePower30s", 120_000.0, 120_000.0),
+    (12, "ChargePower2s", 90_000.0, 90_000.0),
+    (10, "ChargePower10s", 80_000.0, 80_000.0),
+    (10, "ChargePower10sStd", 3_000.0, 3_000.0),
+    (12, "ChargePower30s", 70_000.0, 70_000.0),
 ];
 
 fn health_fields(of: impl Fn(usize) -> Option<f64>) -> HealthFields {
+    let mut outlook = PackValues::default();
+    for (_, quantity, _) in OUTLOOK.iter().filter(|(_, _, part)| *part == Part::Mean) {
+        let [mean, std] = [Part::Mean, Part::Std].map(|part| {
+            let place = OUTLOOK.iter().position(|(_, other, of)| (other, *of) == (quantity, part));
+            place.and_then(|place| of(HEALTH.len() + place))
+        });
+        // A standard deviation has a mean.
+        outlook.set(*quantity, mean.or(std).map(|known| Estimate { mean: mean.unwrap_or(known), std }));
+    }
     HealthFields {
         capacity_ah: of(0),
         capacity_std_ah: of(1),
@@ -141,6 +169,7 @@ fn health_fields(of: impl Fn(usize) -> Option<f64>) -> HealthFields {
         lam_ne: [of(13), of(14)],
         lam_pe: [of(15), of(16)],
         model_state: of(17).map(|state| state as u8),
+        outlook,
     }
 }
 
@@ -152,19 +181,32 @@ fn health_pages_decode_within_half_a_bit() {
         assert_decodes(&format!("Health.{name}"), &frame, wanted);
         assert_eq!(read("Health.Page", &frame).0, u64::try_from(page).unwrap());
         assert_eq!((frame.len(), &frame.data()[..2]), (8, &[0, 0][..]));
-        assert_eq!(plan().health(page + 5, &fields), frame, "the first page follows the last");
+        assert_eq!(plan().health(page + 13, &fields), frame, "the first page follows the last");
+    }
+}
+
+#[test]
+fn outlook_pages_are_sent_only_if_wanted() {
+    let with = OutputPlan::new(&default_database().unwrap()).unwrap();
+    let without = with.clone().without_outlook();
+    assert_eq!((with.health_pages(), without.health_pages()), (13, 5));
+    assert!(with.has_outlook() && !without.has_outlook());
+    let fields = health_fields(|n| Some(HEALTH_VALUES[n].2));
+    for page in 0..5 {
+        let [a, b] = [&with, &without].map(|plan| plan.health(page, &fields, &mut SendCounters::default()));
+        assert_eq!(a, b);
     }
 }
 
 #[test]
 fn single_health_value_leaves_others_not_available() {
-    for known in 0..HEALTH_VALUES.len() {
+    for (known, (_, known_name, _, _)) in HEALTH_VALUES.into_iter().enumerate() {
         let fields = health_fields(|n| (n == known).then_some(HEALTH_VALUES[n].2));
         for (n, (page, name, _, wanted)) in HEALTH_VALUES.into_iter().enumerate() {
             let frame = plan().health(page, &fields);
             if n == known {
                 assert_decodes(&format!("Health.{name}"), &frame, wanted);
-            } else {
+            } else if known_name != format!("{name}Std") || n < HEALTH.len() {
                 assert_not_available(&format!("Health.{name}"), &frame);
             }
         }
@@ -206,7 +248,9 @@ fn extremes_saturate_and_never_become_not_available() {
             assert_decodes(name, &status, end(name));
         }
         let fields = health_fields(|_| Some(extreme));
-        for (page, name, _, _) in HEALTH_VALUES {
+        // Energy, time and power are unknown unless they are finite.
+        let sent = if extreme.is_finite() { HEALTH_VALUES.len() } else { HEALTH.len() };
+        for (page, name, _, _) in HEALTH_VALUES.into_iter().take(sent) {
             let name = format!("Health.{name}");
             assert_decodes(&name, &plan().health(page, &fields), end(&name));
         }
@@ -346,8 +390,9 @@ fn ambiguous_value_signals_are_rejected() {
     );
     let unreachable = faults("Page M : 16|4@1+", "Page M : 16|1@1+").len();
     assert_eq!(
-        unreachable, 18,
-        "health: three signals on page 2, three on page 3, six on page 4; digest: three each on pages 2 and 3"
+        unreachable, 36,
+        "health: three signals on page 2, three on page 3, six on page 4, eighteen on pages 5 to 12; digest: three each on \
+         pages 2 and 3"
     );
 }
 

@@ -61,8 +61,7 @@ impl<'a> Basis<'a> {
     pub(super) fn new(prior: &'a LabelPrior, rows: &'a [Row]) -> Self {
         let stretches = rows.chunk_by(|a, b| a.stretch == b.stretch);
         let stretch = stretches.enumerate().flat_map(|(k, rows)| vec![k; rows.len()]).collect();
-        let expected = prior.fleet.as_ref().map(|fleet| &fleet.mean);
-        Self { model: &prior.model, curve: &prior.curve, expected, rows, stretch }
+        Self { model: &prior.model, curve: &prior.curve, expected: prior.expected.as_ref(), rows, stretch }
     }
 
     /// Number of parameters.

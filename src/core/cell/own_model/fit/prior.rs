@@ -3,8 +3,7 @@
 use nalgebra::DMatrix;
 
 use super::basis::{BEGINNINGS, BY_TEMPERATURE, COLD_SAG, FACTORS, LOG_CAPACITY, OFFSET};
-use crate::cell::chemistry::{FACTOR_SOC, LabelPrior, RESISTANCES, curve, usual_cold_sag_v};
-use crate::cell::fleet_prior::FleetPrior;
+use crate::cell::chemistry::{FACTOR_SOC, LabelPrior, RESISTANCES, curve};
 use crate::cell::own_model::{FACTOR_NODES, SOC_NODES};
 use crate::filter::bell;
 
@@ -20,24 +19,22 @@ const SHAPE_LOG_STD: f64 = 0.15;
 /// deviation. The open-circuit curve is steep near empty, so diffusion appears as resistance.
 const LOW_LOG_STD: [f64; 3] = [0.7, 0.6, 0.5];
 
-/// Information matrix of the parameters' prior, whose means are the values of the label or of the fleet. `None` if a
+/// Information matrix of the parameters' prior, whose means are the expected values. `None` if a
 /// covariance is not positive definite.
 pub(super) fn information(of: &LabelPrior, size: usize) -> Option<DMatrix<f64>> {
-    let (rated_ah, fleet) = (of.label.rated_ah, of.fleet.as_ref());
-    let label_log_std = of.model.spread.map_or(0.0, |spread| spread.log_resistance);
-    let log_ratio = fleet.map_or(1.0, |fleet| (fleet.spread.log_resistance / label_log_std).min(1.0));
+    let log_ratio = of.log_resistance_ratio;
     let mut prior = DMatrix::zeros(size, size);
-    let curve = curve::information(&fleet.map_or_else(|| of.curve.covariance.clone(), FleetPrior::covariance))?;
+    let curve = curve::information(&of.curve.covariance)?;
     prior.view_mut((0, 0), (SOC_NODES, SOC_NODES)).copy_from(&curve);
     let count = RESISTANCES * FACTOR_NODES;
     let covariance = DMatrix::from_fn(count, count, factor_covariance) * (log_ratio * log_ratio);
     prior.view_mut((FACTORS, FACTORS), (count, count)).copy_from(&covariance.cholesky()?.inverse());
     let mut near = |i: usize, std: f64| prior[(i, i)] = 1.0 / (std * std);
     (BY_TEMPERATURE..COLD_SAG).for_each(|i| near(i, 0.25 * log_ratio));
-    near(COLD_SAG, fleet.map_or(usual_cold_sag_v(), |fleet| fleet.mean.cold_sag_v).std());
-    near(LOG_CAPACITY, fleet.map_or(0.1, |fleet| fleet.mean.capacity.std() / fleet.mean.capacity.mean));
+    near(COLD_SAG, of.cold_sag_std_v);
+    near(LOG_CAPACITY, of.capacity_std);
     // Standard deviation of the offset: the current that moves the rated capacity in 700 h.
-    near(OFFSET, rated_ah / 700.0);
+    near(OFFSET, of.label.rated_ah / 700.0);
     // Wide prior, because the voltages determine the SOC at the start of a stretch.
     (BEGINNINGS..size).for_each(|i| near(i, 0.5));
     Some(prior)

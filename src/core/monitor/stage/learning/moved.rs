@@ -26,7 +26,7 @@ pub struct MovedSums {
     pub discharged_wh: f64,
 }
 
-/// The sums, and the charge without a voltage.
+/// The sums, and charge not yet counted as energy because no voltage was known.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct MovedCounter {
@@ -40,7 +40,9 @@ pub(crate) struct MovedCounter {
 impl MovedCounter {
     /// Counts the current up to `now`; `None` = unknown. `voltage_v` returns the voltage of the pack.
     pub(crate) fn observe(&mut self, now: Timestamp, current_a: Option<f64>, voltage_v: impl FnOnce() -> Option<f64>) {
-        let seconds = self.latest.replace(now).map_or(0.0, |latest| now.since(latest));
+        // The time before and after an unknown current is not counted.
+        let before = std::mem::replace(&mut self.latest, current_a.map(|_| now));
+        let seconds = before.map_or(0.0, |before| now.since(before));
         let Some(current_a) = current_a.filter(|_| seconds > 0.0 && seconds <= LONGEST_S) else { return };
         let charge_ah = current_a.abs() * seconds / 3600.0;
         let is_discharge = current_a > 0.0;
@@ -103,6 +105,9 @@ mod tests {
         close(drive(54_001, 56_000, None, Some(420.0)), [5.0, 10.0, 2100.0, 4000.0]);
         close(drive(56_001, 92_000, Some(1.0), None), [5.0, 11.0, 2100.0, 4000.0]);
         close(drive(92_001, 92_010, Some(0.0), Some(400.0)), [5.0, 11.0, 2100.0, 4400.0]);
+        // Neither an unknown current nor the time until the next current is counted.
+        drive(92_011, 92_011, None, Some(400.0));
+        close(drive(92_210, 92_210, Some(100.0), Some(400.0)), [5.0, 11.0, 2100.0, 4400.0]);
         // A gap is not counted.
         close(drive(200_000, 200_000, Some(100.0), Some(400.0)), [5.0, 11.0, 2100.0, 4400.0]);
     }

@@ -228,11 +228,19 @@ impl AlarmQueue {
         self.changed.iter_mut().for_each(|changed| changed.due = changed.due.min(now));
     }
 
-    /// Limits every due time of a stored state to the due time that would follow from a frame sent at `now`.
-    pub(crate) fn limit(&mut self, now: Timestamp, period_s: f64) {
-        self.free = self.free.min(now.plus_nanos(DELAY_NS));
+    /// Limits every due time of a state stored at `stored` to the due time that would follow from a frame sent at
+    /// `now`. If time has passed since then, the budget starts used up, because an earlier process may have sent a burst
+    /// just before its end.
+    pub(crate) fn limit(&mut self, stored: Timestamp, now: Timestamp, period_s: f64) {
+        let least = if stored < now { now.plus_nanos(DELAY_NS) } else { self.free };
+        self.free = least.min(now.plus_nanos(DELAY_NS));
         self.turn = self.turn.map(|turn| turn.min(now.plus_secs(period_s)));
         self.changed.iter_mut().for_each(|changed| changed.due = changed.due.min(now.plus_nanos(REPETITION_NS)));
+    }
+
+    /// Uses up the budget, because frames of an earlier process may have used it at any time up to `now`.
+    pub(crate) fn use_up(&mut self, now: Timestamp) {
+        self.free = now.plus_nanos(DELAY_NS);
     }
 
     /// Shifts stored times to another clock.

@@ -298,16 +298,20 @@ section! {
 }
 
 section! {
-    /// Limits for the remaining energy, the times to empty and to full, and the power.
+    /// Limits for the remaining energy, the times to empty and to full, the power, and the record of use.
     Outlook at "outlook" gives OutlookConfig, |keys, usable: Option<UsableConfig>, rated_ah: f64| {
-        /// Lowest voltage of a cell under load.
+        /// Lowest voltage of a cell under load. From half of the cell model's lowest voltage to below its highest.
         min_voltage_v: Option<f64>, "V", Above(0.0, 100.0), Optional("the cell model's lowest voltage");
-        /// Highest voltage of a cell under charge.
+        /// Highest voltage of a cell under charge. At most 0.5 V above the cell model's highest.
         max_voltage_v: Option<f64>, "V", Above(0.0, 100.0), Optional("the cell model's highest voltage");
         /// Largest discharge current, per cell.
         max_discharge_a: Option<f64>, "A", Above(0.0, 1e6), Optional("only the voltages limit the current");
-        /// Largest charging current, per cell. Below 0 degrees C, a voltage limit does not prevent lithium plating; only this limit does.
+        /// Largest charging current, per cell. Set it for use below 0 degrees C: there, the voltage limit alone allows currents that cause lithium plating.
         max_charge_a: Option<f64>, "A", Above(0.0, 1e6), Optional("only the voltages limit the current");
+        /// Lowest temperature of a sensor. It does not change energy, times and power; time below it is counted in the record of use.
+        min_temperature_c: Option<f64>, "degrees C", TEMPERATURE_C, Optional("time at low temperatures is not counted");
+        /// Highest temperature of a sensor. It does not change energy, times and power; time above it is counted in the record of use.
+        max_temperature_c: Option<f64>, "degrees C", TEMPERATURE_C, Optional("time at high temperatures is not counted");
         /// A charge is complete when its current, per cell, has dropped to this value at the highest voltage.
         taper_current_a: Option<f64>, "A", Above(0.0, 1e6), Optional("`taper_current_a` of `[usable]`, else C/20: the rated capacity over 20 h")
             => taper_current_a: keys.taper_current_a.or(usable.map(|usable| usable.taper_current_a)).unwrap_or(rated_ah / 20.0);

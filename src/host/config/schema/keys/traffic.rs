@@ -57,8 +57,10 @@ section! {
         interfaces: Option<Vec<String>>, "", NotEmpty, Optional("all");
         /// DBC that defines the layout of the frames, relative to this file.
         dbc: Option<String>, "", NotEmpty, Optional("built-in `packwatch.dbc`, with an Ah resolution that fits the cell");
-        /// Whether cyclic frames (with DM1 of `[j1939]`) go on while the buses sleep (`input.asleep_after_s`). They can keep other nodes awake and empty a battery. Alarm changes, replies and tests are always sent.
+        /// Whether cyclic frames (also DM1 and the freshness announcement) are sent while the buses sleep (`input.asleep_after_s`). Cyclic frames can keep other nodes awake and drain the 12 V battery. Alarm changes, replies and tests are sent in both cases.
         while_asleep: bool, "", Any, Default("false");
+        /// Whether the health frame also has the pages 5 to 12: energy, time and power with their standard deviations (`[outlook]`).
+        outlook: bool, "", Any, Default("false");
     }
 }
 

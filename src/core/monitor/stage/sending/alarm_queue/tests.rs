@@ -160,7 +160,7 @@ fn stored_times_far_ahead_do_not_stop_sending() {
     sent(&mut queue, &engine, 0, 2_000);
     queue.note_change(Timestamp::from_secs(2.0), cell_key(1));
     queue.rebase(i64::MAX / 2);
-    queue.limit(Timestamp::from_secs(2.0), PERIOD_S);
+    queue.limit(Timestamp::from_secs(2.0), Timestamp::from_secs(2.0), PERIOD_S);
     assert!(sent(&mut queue, &engine, 2_000, 1_500).len() >= 5);
 }
 
@@ -172,4 +172,21 @@ fn clock_set_back_does_not_stop_sending() {
     queue.note_change(Timestamp::from_secs(1_002.0), cell_key(1));
     queue.restart(Timestamp::ZERO);
     assert!(sent(&mut queue, &engine, 0, 1_500).len() >= 5);
+}
+
+#[test]
+fn restart_after_burst_sends_no_second_burst() {
+    let (mut queue, engine) = (AlarmQueue::default(), engine());
+    for cell in 0..CELLS {
+        queue.note_change(Timestamp::from_secs(10.0), cell_key(cell));
+    }
+    // The state was stored before the first frame.
+    let mut stored = queue.clone();
+    let mut frames = sent(&mut queue, &engine, 10_000, 100).len();
+    assert!(frames > usize::try_from(BURST).unwrap());
+    let now = Timestamp::from_secs(10.1);
+    stored.limit(Timestamp::from_secs(10.0), now, PERIOD_S);
+    stored.restart(now);
+    frames += sent(&mut stored, &engine, 10_100, 900).len();
+    assert!(frames <= 101 + usize::try_from(BURST).unwrap(), "{frames} frames in a second");
 }
