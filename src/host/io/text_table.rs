@@ -34,3 +34,17 @@ pub fn text_table<H: AsRef<str>>(heads: &[H], rows: impl IntoIterator<Item = Vec
     };
     rows.iter().map(line).collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_cannot_control_terminal_or_forge_rows() {
+        let rows = vec![vec!["\u{1b}[31mred\nall is well".to_owned(), "\u{9b}2J".to_owned()]];
+        let table = text_table(&["name", "value"], rows, 1);
+        assert_eq!(table.lines().count(), 2, "{table}");
+        assert!(table.chars().all(|c| !c.is_control() || c == '\n'), "{table:?}");
+        assert!(table.contains("\\u001b[31mred all is well") && table.contains("\\u009b2J"), "{table}");
+    }
+}
