@@ -14,7 +14,7 @@
 //! * Once a second, the service loop copies the values of a document into a draft and offers the draft to a separate
 //!   thread. That thread serialises the draft and serves the clients, so no client affects the loop. A draft offered
 //!   while the thread is busy is dropped and counted.
-//! * [`SLOTS`] limits the number of clients. Further clients are rejected immediately and counted. A client that does
+//! * `SLOTS` limits the number of clients. Further clients are rejected immediately and counted. A client that does
 //!   not read within [`MAX_SILENCE`] is dropped and counted.
 //! * A document older than [`STALE`] is not sent. The client waits for a fresh document, and receives nothing if no
 //!   fresh document is published within [`MAX_SILENCE`]. A loop that hangs therefore does not look healthy.

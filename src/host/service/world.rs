@@ -191,6 +191,8 @@ struct World {
     now_ns: i64,
     engine: Option<Engine>,
     next_frame: Box<dyn FnMut() -> Option<Frame>>,
+    /// Sent frames that are not yet checked.
+    unchecked: VecDeque<Frame>,
     encoder: InputEncoder,
     sender: Sender,
     /// Commands that were executed and could be sent again.
@@ -224,6 +226,7 @@ impl World {
             now_ns: 1_800_000_000_000_000_000,
             engine: None,
             next_frame: Box::new(|| None),
+            unchecked: VecDeque::new(),
             encoder: InputEncoder::new(&loaded().monitor.input),
             sender: Sender::default(),
             recorded: VecDeque::new(),
@@ -326,6 +329,13 @@ impl World {
             self.silent_steps = 0;
         }
         let asleep = self.silent_steps > 100 && was_asleep && engine.monitor.asleep_since().is_some();
+        // What a commit must precede is not sent before the commit.
+        let is_held = |sent: &&crate::monitor::Transmit| sent.announces && sent.secured.is_none();
+        let held: Vec<Frame> = engine.outputs.frames.iter().filter(is_held).map(|sent| sent.frame).collect();
+        self.unchecked.extend(std::iter::from_fn(&mut self.next_frame));
+        if ticket.is_some() && !self.tampered {
+            assert!(!held.iter().any(|frame| self.unchecked.contains(frame)), "announced before it was stored");
+        }
         let executed = engine.outputs.events.iter().any(|event| {
             matches!(event.kind, EventKind::Command { source: Source::Bus(_), command: Command::Acknowledge(_), .. })
         });
@@ -376,7 +386,7 @@ impl World {
 
     /// The invariants of the sent frames.
     fn check_sent(&mut self, now_ns: i64, is_asleep: bool, is_standby: bool) {
-        while let Some(frame) = (self.next_frame)() {
+        while let Some(frame) = self.unchecked.pop_front().or_else(&mut self.next_frame) {
             self.counts.frames += 1;
             let CanId::Standard(id) = frame.id() else { panic!("{:?} was sent", frame.id()) };
             assert!(ALLOWED.contains(&id), "{id:#X} was sent");
