@@ -127,7 +127,21 @@ fn sleeping_bus_carries_only_changes_unless_configured() {
     come_back(&mut rig);
     assert!(frames_of(&mut rig, 1) > 10, "awake");
     let dm1 = |frame: &&Frame| frame.id().raw() & 0xFF_FF00 == 0xFE_CA00 || frame.id().raw() & 0xFF_0000 == 0xEC_0000;
-    assert!(rig.frames.iter().find(dm1).is_some(), "DM1, in one frame or announced: {:?}", rig.frames);
+    assert!(rig.frames.iter().any(|frame| dm1(&frame)), "DM1, in one frame or announced: {:?}", rig.frames);
+}
+
+#[test]
+fn clock_set_back_after_restart_does_not_delay_quiet() {
+    let mut rig = parked();
+    rig.restart(Downtime::Seconds(1.0));
+    rig.seconds(2);
+    rig.deci -= 36_000;
+    rig.seconds(2);
+    fall_silent(&mut rig);
+    rig.seconds(30);
+    rig.frames.clear();
+    rig.seconds(60);
+    assert_eq!(rig.frames, []);
 }
 
 #[test]

@@ -423,3 +423,22 @@ fn changed_identity_means_new_pack() {
     });
     assert_eq!(who, Some(Source::Bus(BusIndex(0))));
 }
+
+#[test]
+fn restart_begins_with_used_up_budget_of_alarm_frames() {
+    // Time since the budget was used up (s). After 0.2 s, a burst is allowed.
+    let unused_s = |away| {
+        let mut rig = Rig::new("");
+        rig.seconds(20);
+        rig.restart(away);
+        rig.tick();
+        let state = serde_json::to_value(rig.monitor.snapshot()).unwrap();
+        let free = state["sending"]["schedule"]["alarms"]["free"].as_i64().unwrap();
+        (rig.now().nanos() - free) as f64 * 1e-9
+    };
+    for away in [Downtime::Unknown, Downtime::Seconds(5.0)] {
+        assert!(unused_s(away) < 0.001, "{away:?}: {} s", unused_s(away));
+    }
+    // No time has passed, so the state is that of the end.
+    assert!(unused_s(Downtime::Seconds(0.0)) > 10.0, "{}", unused_s(Downtime::Seconds(0.0)));
+}

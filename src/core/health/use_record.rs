@@ -294,6 +294,13 @@ impl UseRecord {
         let sides = [self.temperature_c, self.voltage_v, self.current_a].map(|it| [it.below.events, it.above.events]);
         sides.into_iter().flatten().fold(0, u64::saturating_add)
     }
+
+    /// Observed time in which it was not known whether a value was beyond `limit`, or no limit was configured (s).
+    pub fn unknown_s(&self, limit: &LimitUse) -> f64 {
+        let CRateUse { rest_s, charge_s, discharge_s } = self.c_rate;
+        let moving_s: f64 = charge_s.iter().chain(&discharge_s).sum();
+        (rest_s + moving_s + self.current_a.unknown_s - limit.known_s).max(0.0)
+    }
 }
 
 impl RangeUse {

@@ -9,88 +9,20 @@
 //! Deviation: the disk is a real file system, so writes are neither reordered nor torn; `tests/vcan` cuts the power of a
 //! simulated disk.
 
+mod nodes;
+
 use std::collections::VecDeque;
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use self::nodes::{Dice, Sender, key, loaded};
 use super::engine::Engine;
 use super::*;
 use crate::can::encode::InputEncoder;
 use crate::can::secoc::{Authentication, Profile};
 use crate::can::{CanId, Frame};
-use crate::config::{self, ConfigFiles};
 use crate::monitor::{BusEvent, Command, EventKind, RecordKind, Source};
 use crate::quantity::{CellIndex, Channel, SensorIndex, Timestamp};
-
-const CONFIG: &str = r#"
-[pack]
-cells = 3
-cell_model = "cells/example_nmc_2600.toml"
-[[interface]]
-name = "can0"
-fd = true
-[input]
-dbc = ["pack.dbc"]
-[input.current]
-signal = "Status.Current"
-positive = "discharge"
-[input.cell_voltage]
-signal = "Cells.Voltage{n}"
-[[input.temperature]]
-signal = "Status.Temperature"
-[[input.diagnostic]]
-name = "Bms"
-request = 0x79B
-response = 0x7BB
-service = 0x21
-identifier = 0x01
-parked_every_s = 3
-drive_every_s = 2
-charge_every_s = 2
-signals = [{ name = "Soh", bit = 0, length = 16, factor = 0.01, unit = "%", minimum = 0, maximum = 100 }]
-[input.reported_soh]
-signal = "Bms.Soh"
-[poll]
-enabled = true
-max_requests_per_s = 5
-[transition]
-min_duration_s = 5.0
-[store]
-checkpoint_s = 60
-[output]
-[output.status]
-period_ms = 1000
-fd = true
-secoc = "fd"
-data_id = 0x0323
-[output.freshness]
-data_id = 0x0322
-[commands]
-enabled = true
-fd = true
-secoc = "fd"
-data_id = 0x0321
-[authentication]
-key_file = "can.key"
-[[alarm]]
-rule = "input_missing"
-warning = 1
-[[alarm]]
-rule = "temperature_high"
-warning = { set = 50, clear = 45 }
-latched = true
-[[alarm]]
-rule = "soc_low"
-warning = 0.3
-[[alarm]]
-rule = "capacity_low"
-warning = 5.0
-"#;
-
-const DBC: &str = "VERSION \"\"\nBU_: A\nBO_ 256 Status: 8 A\n SG_ Current : 0|16@1- (0.01,0) [-300|300] \"A\" A\n \
-                   SG_ Temperature : 16|8@1+ (1,-40) [-40|200] \"degC\" A\nBO_ 272 Cells: 8 A\n SG_ Voltage1 : \
-                   0|16@1+ (0.0001,0) [0|5] \"V\" A\n SG_ Voltage2 : 16|16@1+ (0.0001,0) [0|5] \"V\" A\n SG_ Voltage3 : \
-                   32|16@1+ (0.0001,0) [0|5] \"V\" A\n";
 
 /// Time of a step. A real daemon has a tick every 10 ms.
 const STEP_NS: i64 = 100_000_000;
@@ -101,77 +33,6 @@ const ALARM: u16 = 0x6B2;
 /// Cyclic frames.
 const CYCLIC: [u16; 4] = [0x6B0, 0x6B1, 0x6B4, 0x6B6];
 
-fn key() -> CanKey {
-    CanKey::parse(&[0xA0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15]).unwrap()
-}
-
-fn loaded() -> Config {
-    let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config");
-    let read = |path: &Path| match path.to_str() {
-        Some("pack.toml") => Ok(CONFIG.as_bytes().to_vec()),
-        Some("pack.dbc") => Ok(DBC.as_bytes().to_vec()),
-        _ => fs::read(shipped.join(path)),
-    };
-    let files = ConfigFiles::alone(Path::new("pack.toml"));
-    config::load_with(&files, &read).unwrap_or_else(|faults| panic!("{}", faults.0.join("\n")))
-}
-
-/// Pseudo-random numbers (SplitMix64).
-struct Dice(u64);
-
-impl Dice {
-    fn below(&mut self, limit: u64) -> u64 {
-        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-        (z ^ (z >> 31)) % limit
-    }
-
-    fn one_in(&mut self, count: u64) -> bool {
-        self.below(count) == 0
-    }
-}
-
-/// The sender of authenticated commands. It follows the announced freshness.
-#[derive(Default)]
-struct Sender {
-    announced: u64,
-    next: Option<u64>,
-}
-
-impl Sender {
-    const COMMAND: Authentication = Authentication { profile: Profile::Fd, data_id: 0x0321 };
-    const ANNOUNCEMENT: Authentication = Authentication { profile: Profile::Announcement, data_id: 0x0322 };
-
-    /// Follows an announcement. Returns its freshness.
-    fn hear(&mut self, frame: &Frame) -> Option<u64> {
-        let sent = Self::ANNOUNCEMENT.sent_freshness(frame.data())?;
-        let span = 1 << Profile::Announcement.freshness_bits();
-        let high = self.announced / span * span;
-        let found = [high + sent, high + span + sent].into_iter().find(|freshness| {
-            let input = Self::ANNOUNCEMENT.mac_input(frame.data(), *freshness);
-            input.is_some_and(|input| Self::ANNOUNCEMENT.has_mac(frame.data(), key().mac(input.bytes())))
-        })?;
-        if found > self.announced {
-            (self.announced, self.next) = (found, Some(found));
-        }
-        Some(found)
-    }
-
-    /// A command "acknowledge all"; `None` = nothing announced, or all announced values used.
-    fn command(&mut self) -> Option<Frame> {
-        let freshness = self.next.filter(|next| *next < self.announced + 16)?;
-        self.next = Some(freshness + 1);
-        let mut payload = (1_u32 | 31 << 4 | 0x7FF << 11).to_le_bytes().to_vec();
-        payload.resize(4 + Self::COMMAND.profile.trailer_bytes(), 0);
-        Self::COMMAND.write_freshness(&mut payload, freshness);
-        let input = Self::COMMAND.mac_input(&payload, freshness)?;
-        Self::COMMAND.write_mac(&mut payload, key().mac(input.bytes()));
-        Frame::fd(CanId::standard(0x6B3)?, false, false, &payload)
-    }
-}
-
 /// Counts of a life.
 #[derive(Debug, Default)]
 struct Counts {
@@ -179,6 +40,8 @@ struct Counts {
     faults: u64,
     starts: u64,
     commands: u64,
+    /// Recorded commands that were sent again.
+    replays: u64,
     frames: u64,
     commits: u64,
 }
@@ -195,8 +58,12 @@ struct World {
     unchecked: VecDeque<Frame>,
     encoder: InputEncoder,
     sender: Sender,
-    /// Commands that were executed and could be sent again.
+    /// Commands that must not be executed: executed before, or held back across a start.
     recorded: VecDeque<Frame>,
+    /// Commands of this run that an attacker holds back.
+    withheld: Vec<Frame>,
+    /// Steps until the recorded commands are sent.
+    replay_in: u32,
     /// Highest freshness of all sent frames.
     freshness: u64,
     /// Rows of the history that were confirmed.
@@ -230,6 +97,8 @@ impl World {
             encoder: InputEncoder::new(&loaded().monitor.input),
             sender: Sender::default(),
             recorded: VecDeque::new(),
+            withheld: Vec::new(),
+            replay_in: 0,
             // The freshness of a first start follows from the clock.
             freshness: 1_800_000_000 * 256 - 1,
             rows: 0,
@@ -293,6 +162,8 @@ impl World {
         (self.rows, self.tampered) = (progress.rows, false);
         (self.engine, self.next_frame) = (Some(engine), Box::new(next_frame));
         self.silent_steps = 0;
+        self.recorded.extend(self.withheld.drain(..));
+        self.replay_in = 20;
         self.counts.starts += 1;
     }
 
@@ -365,7 +236,7 @@ impl World {
         {
             assert!(!self.recorded.contains(frame), "a recorded command was executed again");
             self.recorded.push_back(*frame);
-            self.recorded.truncate(200);
+            self.recorded.drain(..self.recorded.len().saturating_sub(200));
             self.counts.commands += 1;
         }
         if ticket.is_some() {
@@ -460,6 +331,10 @@ impl World {
         }
         self.settle(now);
         self.check();
+        self.replay_in = self.replay_in.saturating_sub(1);
+        if self.replay_in == 1 {
+            self.send_recorded();
+        }
         if self.dice.one_in(100) {
             self.fault();
         }
@@ -518,14 +393,16 @@ impl World {
             5 => self.flood(),
             6 | 7 => {
                 if let Some(frame) = self.sender.command() {
+                    if self.dice.one_in(3) {
+                        self.withheld.push(frame);
+                        return;
+                    }
                     let is_cut = self.dice.one_in(4);
                     self.give(&Record::frame(time, BUS, &frame), is_cut);
                 }
             }
             8 => {
-                for frame in self.recorded.clone().iter().rev().take(20) {
-                    self.give(&Record::frame(self.now(), BUS, frame), false);
-                }
+                self.send_recorded();
             }
             9 => {
                 let standby = self.dice.one_in(2);
@@ -552,6 +429,14 @@ impl World {
                 let frame = Frame::classic(CanId::Standard(0x7DF), &[2, 1, 0, 0, 0, 0, 0, 0]).expect("short");
                 self.give(&Record::frame(time, BUS, &frame), false);
             }
+        }
+    }
+
+    /// Sends the newest commands that must not be executed.
+    fn send_recorded(&mut self) {
+        for frame in self.recorded.clone().iter().rev().take(20) {
+            self.counts.replays += 1;
+            self.give(&Record::frame(self.now(), BUS, frame), false);
         }
     }
 
@@ -624,11 +509,12 @@ fn live(seed: u64, steps: u64) -> Counts {
 
 impl std::ops::AddAssign for Counts {
     fn add_assign(&mut self, other: Self) {
-        let Self { steps, faults, starts, commands, frames, commits } = other;
+        let Self { steps, faults, starts, commands, replays, frames, commits } = other;
         self.steps += steps;
         self.faults += faults;
         self.starts += starts;
         self.commands += commands;
+        self.replays += replays;
         self.frames += frames;
         self.commits += commits;
     }

@@ -316,7 +316,8 @@ impl<'a> Battery<'a> {
         if terms.moved_before_ah != Some(0.0) {
             return Err("the record does not start with the new battery (--throughput-before-ah 0)".to_owned());
         }
-        let UseRecord { temperature_c, half_cycles, c_rate, current_a, .. } = self.monitor.use_record();
+        let record = self.monitor.use_record();
+        let UseRecord { temperature_c, half_cycles, .. } = record;
         let limit = side(temperature_c);
         let counted = half_cycles.discharges.iter().sum::<u64>() + half_cycles.charges + half_cycles.unknown;
         if let Some(gap) = &self.record.gap {
@@ -328,8 +329,7 @@ impl<'a> Battery<'a> {
         if limit.known_s == 0.0 {
             return Err("no temperature limit is configured ([outlook]), or no temperature was known".to_owned());
         }
-        let moving_s: f64 = c_rate.charge_s.iter().chain(&c_rate.discharge_s).sum();
-        let unknown_s = moving_s + c_rate.rest_s + current_a.unknown_s - limit.known_s;
+        let unknown_s = record.unknown_s(&limit);
         if is_too_much(unknown_s, limit.known_s) {
             return Err(format!("the temperature, or its limit, was unknown for {unknown_s:.0} s of the record"));
         }

@@ -1,3 +1,5 @@
+//! Compares the counts with profiles whose times and events are known: limits, rest, half-cycles, gaps, restarts.
+
 use super::*;
 
 const LIMITS: UseLimits = UseLimits {
@@ -206,4 +208,16 @@ fn single_reading_is_no_event() {
     let LimitUse { beyond_s, events, .. } = observe(10..60, &hot);
     assert!((beyond_s - 5.0).abs() < 0.2 && events == 0, "{beyond_s} s, {events} events");
     assert_eq!(observe(60..110, &hot).events, 1, "two readings");
+}
+
+#[test]
+fn time_without_limit_is_unknown() {
+    let unlimited = UseLimits { temperature_c: [None; 2], ..LIMITS };
+    let mut counter = UseCounter::default();
+    for second in 0..=150 {
+        let limits = if second <= 100 { &unlimited } else { &LIMITS };
+        counter.observe(Timestamp::from_secs(f64::from(second)), limits, &REST);
+    }
+    let record = counter.record();
+    close([record.unknown_s(&record.temperature_c.above), record.unknown_s(&record.voltage_v.above)], [100.0, 0.0]);
 }
