@@ -67,10 +67,11 @@ impl Stages {
             model: bank.model(index),
             soc,
             capacity: self.learning.capacity(index),
-            log_resistance: ScalarGaussian { variance: of_cell.variance + square(local) + square(outside), ..of_cell },
+            resistance_ratio: libm::exp(of_cell.mean),
+            log_resistance_std: (of_cell.variance + square(local) + square(outside)).sqrt(),
             slow_ratio: estimator.slow_ratio(bank.config(index)).mean,
             branch_v: estimator.branch_v(),
-            temperature_c,
+            temperature: bank.model(index).temperature_position(temperature_c),
         })
     }
 }
