@@ -224,8 +224,12 @@ impl Estimation {
     fn check_current(&mut self, samples: &[CellSample]) {
         let Self { bank, current_check, .. } = self;
         let own = bank.own_cells();
-        let place = |sample: &CellSample| own.iter().take(MAX_CELLS).position(|&cell| cell == sample.cell.index());
-        let compared = samples.iter().take(MAX_CELLS).filter_map(|sample| Some((place(sample)?, sample)));
+        let own_compared = &own[..own.len().min(MAX_CELLS)];
+        // The cells are in ascending order.
+        let last = own_compared[own_compared.len() - 1];
+        let is_near = |sample: &&CellSample| sample.cell.index() <= last;
+        let place = |sample: &CellSample| own_compared.iter().position(|&cell| cell == sample.cell.index());
+        let compared = samples.iter().filter(is_near).filter_map(|sample| Some((place(sample)?, sample)));
         let soc = bank.filtered_soc(own[0]).map_or(0.5, |soc| soc.mean.clamp(0.0, 1.0));
         let temperature_c = bank.temperature_c(own[0]).unwrap_or(self.ambient_c);
         let ohm = bank.own_model().r0_ohm(&bank.own_model().grid_position(soc, temperature_c));

@@ -1,7 +1,10 @@
 //! Compares the steps of the measured current with the steps of the cells' voltages.
 //!
-//! In: *rounds* (the voltages of the cells, read one after another, and the current at that time), and the series
-//! resistance according to the model. Out: whether the current is doubtful.
+//! In: samples of the compared cells, and the series resistance according to the model. Out: whether the current is
+//! doubtful.
+//!
+//! A *round* contains one sample of each cell, and the current of the last sample. A round is complete when all cells of
+//! the previous round have reported. If one of them is missing, the round ends when another cell reports again.
 //!
 //! A step of the current moves the voltages of all cells in the opposite direction, by the resistance times the step.
 //! The check judges each clear step between two steady levels of the voltages. The step is *explained* if the current
@@ -77,7 +80,25 @@ const COARSE_V: f64 = 0.05;
 pub(crate) const MAX_CELLS: usize = 15;
 const ROUNDS: usize = 4;
 
-/// One round of voltages.
+/// The round whose samples are arriving.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct OpenRound {
+    /// Voltage of each compared cell (V); `None` = not reported yet.
+    voltages_v: [Option<f64>; MAX_CELLS],
+    /// Time of the latest sample.
+    time: Timestamp,
+    /// Current of the latest sample (A); `None` = unknown.
+    current_a: Option<f64>,
+}
+
+impl OpenRound {
+    fn has_all_of(&self, others: &[Option<f64>; MAX_CELLS]) -> bool {
+        self.voltages_v.iter().zip(others).all(|(found, other)| found.is_some() || other.is_none())
+    }
+}
+
+/// A complete round.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Round {
@@ -94,6 +115,7 @@ struct Round {
 pub(crate) struct CurrentCheck {
     /// Voltage of each compared cell in the latest round (V); `None` = no reading.
     voltages_v: [Option<f64>; MAX_CELLS],
+    open: OpenRound,
     /// The latest rounds, the oldest first.
     rounds: [Round; ROUNDS],
     /// Number of valid rounds, counted from the latest.
@@ -126,6 +148,7 @@ impl Default for CurrentCheck {
     fn default() -> Self {
         Self {
             voltages_v: [None; MAX_CELLS],
+            open: OpenRound::default(),
             rounds: [Round::default(); ROUNDS],
             count: 0,
             evidence: 0.0,
@@ -165,9 +188,9 @@ impl CurrentCheck {
         self.is_unconfirmed
     }
 
-    /// Handles a round. `samples`: the compared cells that have reported, each with its place (below [`MAX_CELLS`]).
-    /// `noise_v`: standard deviation of a reading. `ohm`: the model's series resistance. `rest_a`: largest current at
-    /// rest.
+    /// Handles samples of a round, or of a part of it. `samples`: the compared cells that have reported, each with its
+    /// place (below [`MAX_CELLS`]). `noise_v`: standard deviation of a reading. `ohm`: the model's series resistance.
+    /// `rest_a`: largest current at rest.
     pub(crate) fn handle<'a>(
         &mut self,
         samples: impl Iterator<Item = (usize, &'a CellSample)>,
@@ -175,21 +198,32 @@ impl CurrentCheck {
         ohm: f64,
         rest_a: f64,
     ) {
-        let (mut moves_v, mut moves, mut latest) = ([0.0; MAX_CELLS], 0, None);
-        // Skips cells without a reading in the previous round: their change spans more than one round.
-        let before_v = std::mem::replace(&mut self.voltages_v, [None; MAX_CELLS]);
+        let mut has_samples = false;
         for (place, sample) in samples {
-            latest = Some(sample);
-            self.voltages_v[place] = Some(sample.voltage_v);
-            if let Some(before_v) = before_v[place] {
-                moves_v[moves] = sample.voltage_v - before_v;
-                if moves_v[moves] != 0.0 {
-                    self.resolution_v = self.resolution_v.min(moves_v[moves].abs());
-                }
-                moves += 1;
+            if self.open.voltages_v[place].is_some() {
+                self.end_round(noise_v, ohm, rest_a);
             }
+            self.open.voltages_v[place] = Some(sample.voltage_v);
+            (self.open.time, self.open.current_a, has_samples) = (sample.time, sample.current_a, true);
         }
-        let Some(&CellSample { time, current_a, .. }) = latest else { return };
+        if has_samples && self.voltages_v != [None; MAX_CELLS] && self.open.has_all_of(&self.voltages_v) {
+            self.end_round(noise_v, ohm, rest_a);
+        }
+    }
+
+    /// Ends the open round and compares it with the rounds before it.
+    fn end_round(&mut self, noise_v: f64, ohm: f64, rest_a: f64) {
+        let OpenRound { voltages_v, time, current_a } = std::mem::take(&mut self.open);
+        let before_v = std::mem::replace(&mut self.voltages_v, voltages_v);
+        let (mut moves_v, mut moves) = ([0.0; MAX_CELLS], 0);
+        // Skips cells without a reading in the previous round: their change spans more than one round.
+        for (before_v, voltage_v) in before_v.into_iter().zip(voltages_v).filter_map(|(a, b)| a.zip(b)) {
+            moves_v[moves] = voltage_v - before_v;
+            if moves_v[moves] != 0.0 {
+                self.resolution_v = self.resolution_v.min(moves_v[moves].abs());
+            }
+            moves += 1;
+        }
         let move_v = common_move(&mut moves_v[..moves]);
         self.path_v += move_v;
         if moves > 1 {
@@ -285,15 +319,17 @@ impl CurrentCheck {
 
     /// Forgets the latest rounds, because the next reading comes after a pause. The evidence stays.
     pub(crate) fn interrupt(&mut self) {
-        (self.voltages_v, self.rounds, self.count) = ([None; MAX_CELLS], [Round::default(); ROUNDS], 0);
+        (self.voltages_v, self.open) = ([None; MAX_CELLS], OpenRound::default());
+        (self.rounds, self.count) = ([Round::default(); ROUNDS], 0);
         self.limit.pause();
     }
 
     /// Checks a stored state; the error is the first impossible number.
     pub(crate) fn check(&self) -> Result<(), InvalidState> {
-        bounds::VOLTAGE_V.check_all("a voltage of the check of the current", self.voltages_v.into_iter().flatten())?;
-        bounds::CURRENT_A
-            .check_all("a current of the check of the current", self.rounds.map(|round| round.current_a))?;
+        let voltages_v = self.voltages_v.into_iter().chain(self.open.voltages_v).flatten();
+        bounds::VOLTAGE_V.check_all("a voltage of the check of the current", voltages_v)?;
+        let currents_a = self.rounds.iter().map(|round| round.current_a).chain(self.open.current_a);
+        bounds::CURRENT_A.check_all("a current of the check of the current", currents_a)?;
         let numbers = self.rounds.map(|round| round.move_v);
         bounds::NUMBER.check_all("a voltage step of the check of the current", numbers)?;
         let [unexplained, explained] = self.steps;
@@ -315,6 +351,7 @@ impl CurrentCheck {
 
     /// Shifts all timestamps by `by_nanos`, to another clock.
     pub(crate) fn rebase(&mut self, by_nanos: i64) {
+        self.open.time = self.open.time.plus_nanos(by_nanos);
         self.rounds.iter_mut().for_each(|round| round.time = round.time.plus_nanos(by_nanos));
     }
 }
