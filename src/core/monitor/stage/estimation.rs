@@ -210,7 +210,9 @@ impl Estimation {
         let rest_a = self.bank.own_config().gap.rest_current_a;
         let is_rest = |sample: &CellSample| sample.current_a.is_some_and(|a| a != 0.0 && a.abs() <= rest_a);
         let has_jumped = |sample: &&CellSample| self.bank.result(sample.cell.index()).jumped && !is_rest(sample);
-        if 2 * samples.iter().filter(has_jumped).count() > samples.len() {
+        let jumped = samples.iter().filter(has_jumped).count();
+        self.batch.jumped += jumped;
+        if jumped > 0 && 2 * self.batch.jumped > self.progress.len() {
             self.current_check.demand_step();
         }
         self.check_models(&samples);
