@@ -195,6 +195,7 @@ impl Urgency {
             | EventKind::Capacity { .. }
             | EventKind::LossModes { .. }
             | EventKind::RemainingLife { .. }
+            | EventKind::Outlook { .. }
             | EventKind::RechargePeriod { .. }
             | EventKind::Model { .. }
             | EventKind::PackReplaced { .. }

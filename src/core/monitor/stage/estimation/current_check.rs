@@ -4,7 +4,8 @@
 //! doubtful.
 //!
 //! A *round* contains one sample of each cell, and the current of the last sample. A round is complete when all cells of
-//! the previous round have reported. If one of them is missing, the round ends when another cell reports again.
+//! the previous round have reported. If one of them is missing, the round ends when another cell reports again. A round
+//! that takes longer than [`MAX_ROUND_S`] is not compared.
 //!
 //! A step of the current moves the voltages of all cells in the opposite direction, by the resistance times the step.
 //! The check judges each clear step between two steady levels of the voltages. The step is *explained* if the current
@@ -64,6 +65,9 @@ const MOVE_V: (f64, f64) = (1e-4, 0.05);
 const FIRST_MOVE_V: f64 = 0.01;
 /// Weight of an explained step in the usual resistance (as ln).
 const RATIO_GAIN: f64 = 0.1;
+/// Longest time from the first to the last sample of a round (s). In a longer round, the cells were read at different
+/// currents.
+const MAX_ROUND_S: f64 = 1.0;
 /// Longest time between two rounds (s). After a longer pause, the steps are not compared.
 const MAX_PAUSE_S: f64 = 60.0;
 /// Part of the earlier doubts that remains after an explained step.
@@ -86,6 +90,8 @@ const ROUNDS: usize = 4;
 struct OpenRound {
     /// Voltage of each compared cell (V); `None` = not reported yet.
     voltages_v: [Option<f64>; MAX_CELLS],
+    /// Time of the first sample; `None` = no sample yet.
+    began: Option<Timestamp>,
     /// Time of the latest sample.
     time: Timestamp,
     /// Current of the latest sample (A); `None` = unknown.
@@ -93,6 +99,12 @@ struct OpenRound {
 }
 
 impl OpenRound {
+    fn add(&mut self, place: usize, sample: &CellSample) {
+        self.voltages_v[place] = Some(sample.voltage_v);
+        self.began.get_or_insert(sample.time);
+        (self.time, self.current_a) = (sample.time, sample.current_a);
+    }
+
     fn has_all_of(&self, others: &[Option<f64>; MAX_CELLS]) -> bool {
         self.voltages_v.iter().zip(others).all(|(found, other)| found.is_some() || other.is_none())
     }
@@ -203,8 +215,8 @@ impl CurrentCheck {
             if self.open.voltages_v[place].is_some() {
                 self.end_round(noise_v, ohm, rest_a);
             }
-            self.open.voltages_v[place] = Some(sample.voltage_v);
-            (self.open.time, self.open.current_a, has_samples) = (sample.time, sample.current_a, true);
+            self.open.add(place, sample);
+            has_samples = true;
         }
         if has_samples && self.voltages_v != [None; MAX_CELLS] && self.open.has_all_of(&self.voltages_v) {
             self.end_round(noise_v, ohm, rest_a);
@@ -213,8 +225,12 @@ impl CurrentCheck {
 
     /// Ends the open round and compares it with the rounds before it.
     fn end_round(&mut self, noise_v: f64, ohm: f64, rest_a: f64) {
-        let OpenRound { voltages_v, time, current_a } = std::mem::take(&mut self.open);
+        let OpenRound { voltages_v, began, time, current_a } = std::mem::take(&mut self.open);
         let before_v = std::mem::replace(&mut self.voltages_v, voltages_v);
+        if began.is_none_or(|began| time.since(began) > MAX_ROUND_S) {
+            self.count = 0;
+            return;
+        }
         let (mut moves_v, mut moves) = ([0.0; MAX_CELLS], 0);
         // Skips cells without a reading in the previous round: their change spans more than one round.
         for (before_v, voltage_v) in before_v.into_iter().zip(voltages_v).filter_map(|(a, b)| a.zip(b)) {
@@ -351,6 +367,7 @@ impl CurrentCheck {
 
     /// Shifts all timestamps by `by_nanos`, to another clock.
     pub(crate) fn rebase(&mut self, by_nanos: i64) {
+        self.open.began = self.open.began.map(|began| began.plus_nanos(by_nanos));
         self.open.time = self.open.time.plus_nanos(by_nanos);
         self.rounds.iter_mut().for_each(|round| round.time = round.time.plus_nanos(by_nanos));
     }

@@ -178,6 +178,17 @@ fn relaxation_after_load_is_not_a_step() {
 }
 
 #[test]
+fn round_that_takes_seconds_is_not_compared() {
+    let mut check = CurrentCheck::default();
+    for time_s in (0..3600).step_by(4) {
+        let mut samples = drive_samples(time_s, |load_a, _| Some(-load_a));
+        samples[CELLS - 1].time = Timestamp::from_secs(f64::from(time_s + 2));
+        handle(&mut check, &samples);
+    }
+    assert_eq!((check.is_doubtful(), check.path_v()), (false, 0.0));
+}
+
+#[test]
 fn samples_that_arrive_in_parts_make_whole_rounds() {
     let measured: fn(f64, u32) -> Option<f64> = |load_a, time_s| Some(if time_s < 1200 { load_a } else { -load_a });
     let (mut whole, mut in_parts, mut with_gaps) = Default::default();
