@@ -24,7 +24,8 @@ use crate::quantity::{CellIndex, InvalidState, Mode, Timestamp};
 pub const POWER_S: [f64; 3] = [2.0, 10.0, 30.0];
 /// Time over which the load of a discharge is averaged (s). Over half an hour, fast and slow parts of a drive mix.
 const LOAD_S: f64 = 1800.0;
-/// Standard deviation of ln(time that the charger holds the voltage). Models without a slow branch taper too fast.
+/// Standard deviation of ln(charging time that the taper adds). It is large, because the current of a model without a slow
+/// branch falls too fast.
 const LOG_HELD_STD: f64 = 0.7;
 /// A load is known if its mean is at least this share of its RMS value. If the mean is smaller, charge and discharge
 /// alternate, as in a hybrid, and no time to empty can be forecast.
@@ -76,11 +77,11 @@ pub struct RecentLoad {
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Average {
-    /// Time that the average contains, at most the time of averaging (s).
+    /// Time that the average covers so far, at most its window (s).
     seconds: f64,
     mean_a: f64,
     mean_square_a2: f64,
-    /// Largest current; it decays to the mean with the time of averaging (A).
+    /// Largest recent current (A). It decays towards the mean with the time constant of the window.
     peak_a: f64,
 }
 
@@ -106,7 +107,8 @@ impl Average {
 }
 
 impl RecentLoad {
-    /// Adds the current of a cell at `now`; `None` = the current is unknown. A current up to `rest_a` is no load.
+    /// Adds the current of a cell at `now`; `None` = the current is unknown. If the mode is rest or unknown, a current of at
+    /// most `rest_a` is not averaged.
     pub fn observe(&mut self, now: Timestamp, mode: Mode, current_a: Option<f64>, rest_a: f64) {
         let seconds = self.latest.map_or(0.0, |latest| now.since(latest));
         self.latest = Some(now);
@@ -114,7 +116,7 @@ impl RecentLoad {
         match mode {
             Mode::Charge => self.charge.add(-current_a, seconds, CHARGER_S),
             Mode::Rest | Mode::Unknown if current_a.abs() <= rest_a => self.charge = Average::default(),
-            // A current that changes its sign within seconds gives no mode, but still counts as load.
+            // If the current changes its sign every few seconds, the mode is unknown. The current still counts as load.
             Mode::Discharge | Mode::Rest | Mode::Unknown => {
                 self.charge = Average::default();
                 self.discharge.add(current_a, seconds, LOAD_S);
@@ -122,7 +124,7 @@ impl RecentLoad {
         }
     }
 
-    /// Notes that the current before the next one is unknown, after a sleep or a restart.
+    /// After a sleep or a restart: forgets the time of the latest current, so that the pause is not averaged.
     pub fn interrupt(&mut self) {
         self.latest = None;
     }
@@ -169,8 +171,8 @@ impl Load {
         Self { peak_a: rated_ah, ..Self::constant(USUAL_LOAD_PER_H * rated_ah) }
     }
 
-    /// Voltage that is lost per charge (V): by the mean current in the settled circuit, and by its fluctuations in the
-    /// circuit's first response.
+    /// Energy lost per charge (V). The mean current meets the settled resistance, the fluctuations of the current meet the
+    /// fast resistance.
     fn loss_v(&self, settled_ohm: f64, fast_ohm: f64) -> f64 {
         let fluctuation_a = (self.mean_square_a2 - square(self.mean_a)) / self.mean_a;
         self.mean_a * settled_ohm + fluctuation_a * fast_ohm
@@ -426,7 +428,7 @@ pub fn of_pack(
     let drawn = discharge.unwrap_or(Load::usual(rated_ah));
     let charger = load.charger_a(mode);
     let charger_a = charger.unwrap_or(USUAL_LOAD_PER_H * rated_ah);
-    // A weaker charger ends as soon as the voltage is reached.
+    // If the charger delivers less than the taper current, the charge ends when the first cell reaches its highest voltage.
     let config = &OutlookConfig { taper_current_a: config.taper_current_a.min(charger_a), ..*config };
     let least = |value: &dyn Fn(&CellNow<'_>) -> f64| {
         cells.iter().map(|cell| (value(cell), cell)).min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, cell)| cell)

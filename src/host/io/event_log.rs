@@ -385,7 +385,7 @@ mod tests {
     use crate::cell_faults::CellFaultKind;
     use crate::filter::ScalarGaussian;
     use crate::quantity::Mode;
-    use crate::quantity::catalogue::{RECORDED, RecordedValues};
+    use crate::quantity::catalogue::{RECORDED, RECORDED_OF_PACK, RecordedPackValues, RecordedValues};
 
     #[test]
     fn day_of_errors_gives_forty_complete_lines() {

@@ -165,7 +165,7 @@ impl Estimation {
         self.note_checks();
     }
 
-    /// Whether the current is doubtful, or a jump of the SOC waits for a step of the current that is explained.
+    /// Whether the current is doubtful, or the SOC has jumped and no explained step of the current has confirmed it since.
     pub(crate) fn is_doubtful(&self) -> bool {
         self.is_current_doubtful || self.current_check.is_unconfirmed()
     }
@@ -425,7 +425,7 @@ impl Estimation {
         check.is_of_other(model_id(self.bank.model(index), self.bank.config(index).initial.log_resistance_std))
     }
 
-    /// Mean over the pack's own kind of cells of the SOC and of its variance; `None` if no such cell has an estimate.
+    /// Mean SOC and mean SOC variance of the pack's own kind of cells; `None` if no such cell has an estimate.
     pub(crate) fn mean_estimate(&self) -> Option<ScalarGaussian> {
         let socs = self.bank.own_cells().iter().filter_map(|&cell| self.bank.filtered_soc(cell));
         let (count, mean, variance) = socs.fold((0.0, 0.0, 0.0), |(count, mean, variance), soc| {

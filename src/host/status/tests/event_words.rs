@@ -148,7 +148,7 @@ fn rows() -> Vec<(Value, &'static str)> {
 }
 
 #[test]
-fn words_name_cell_interface_and_state_of_each_kind() {
+fn event_words_name_cell_interface_and_state() {
     let mut unseen: BTreeSet<&str> = EventKind::names().iter().copied().collect();
     for (event, expected) in rows() {
         let kind: EventKind = serde_json::from_value(event.clone()).unwrap_or_else(|error| panic!("{event}: {error}"));

@@ -9,20 +9,21 @@
 //!
 //! A step of the current moves the voltages of all cells in the opposite direction, by the resistance times the step.
 //! The check judges each clear step between two steady levels of the voltages. The step is *explained* if the current
-//! has stepped in the opposite direction, and if the ratio of the two steps (a resistance) is at least 1/[`MAX_FACTOR`]
-//! and at most [`MAX_FACTOR`] times the usual resistance. A step is the mean of two consecutive rounds minus the mean
+//! has stepped in the opposite direction, and if the ratio of the two steps, a resistance, is right. It must lie between
+//! the usual resistance divided by [`MAX_FACTOR`] and the usual resistance times [`MAX_FACTOR`]. A step is the mean of two consecutive rounds minus the mean
 //! of the two rounds before them. Such a step contains less noise than the difference of two readings. A current that
 //! arrives one round earlier or later than the voltages still explains their step.
 //!
 //! Explained and unexplained steps are evidence for and against the sensor. How much they count depends on how many
-//! steps the sensor has left unexplained so far. If a sensor has explained all steps, one unexplained step is enough
-//! for a doubt, because the charge is wrong from the first second. A logger that reads current and voltages seconds
+//! steps the sensor has left unexplained so far. If a sensor has explained all steps, one unexplained step makes the
+//! current doubtful: a wrong current falsifies the counted charge at once. A logger that reads current and voltages seconds
 //! apart leaves many steps unexplained, so one more is only weak evidence.
 //!
 //! The check finds a current that is frozen, inverted, late or beyond the sensor's range, whether or not the last
 //! digits of its readings change. While the load is constant, it finds only a noisy sensor at its limit ([`SensorLimit`]).
-//! A current without sign is found at the first clear steps of a charging current. If a doubted current has never flowed
-//! in both directions, the doubt only ends when it has. A current without sign therefore stays doubtful.
+//! A current without sign is found at the first clear steps of a charging current. If a doubted current has flowed in
+//! only one direction, the doubt ends only after the current has flowed in both. A current without sign therefore stays
+//! doubtful.
 
 mod sensor_limit;
 
@@ -55,13 +56,13 @@ const MIN_STEP_V: f64 = 0.01;
 const STEP_SIGMA: f64 = 5.0;
 /// Smallest clear step, as a multiple of the resolution of the voltages.
 const STEP_READINGS: f64 = 1.5;
-/// Smallest clear step, as a multiple of the usual change between two rounds.
+/// Smallest clear step, as a multiple of the usual change that the current does not explain.
 const STEP_MOVES: f64 = 9.0;
-/// Factor by which each round raises or lowers the usual change, which thus follows the median.
+/// Factor by which each round raises or lowers the usual unexplained change, which thus follows the median.
 const MOVE_GAIN: f64 = 1.02;
-/// Range of the usual change between two rounds (V).
+/// Range of the usual unexplained change (V).
 const MOVE_V: (f64, f64) = (1e-4, 0.05);
-/// Usual change before the first rounds (V). It exceeds the noise of any sensor.
+/// Usual unexplained change before the first rounds (V). It exceeds the noise of any sensor.
 const FIRST_MOVE_V: f64 = 0.01;
 /// Weight of an explained step in the usual resistance (as ln).
 const RATIO_GAIN: f64 = 0.1;
@@ -152,7 +153,7 @@ pub(crate) struct CurrentCheck {
     doubts: f64,
     /// Whether a jump of the SOC in a downtime waits for an explained step.
     is_unconfirmed: bool,
-    /// Whether the current has been contradicted before it has flowed in both directions, and has not done so since.
+    /// Whether the current was contradicted and has still not flowed in both directions.
     is_one_sided: bool,
 }
 
@@ -189,8 +190,9 @@ impl CurrentCheck {
         self.evidence > DOUBTFUL
     }
 
-    /// Handles a jump of the SOC in a downtime: the cells may have been used, or a sensor may have failed. The next
-    /// explained step of the current decides. If no step has ever been judged, the check waits for none.
+    /// Handles a jump of the SOC in a downtime: the cells may have been used, or a sensor may have failed. The SOC
+    /// stays unconfirmed until a step of the current is explained. If no step has ever been judged, the SOC counts as
+    /// confirmed.
     pub(crate) fn demand_step(&mut self) {
         self.is_unconfirmed = self.steps != FIRST_STEPS;
     }

@@ -77,7 +77,7 @@ fn good_current_is_never_doubted() {
 }
 
 #[test]
-fn wrong_current_is_doubted_within_seconds() {
+fn wrong_current_is_doubted_in_most_of_drive() {
     let faults: [Fault; 5] = [
         ("zero", |_, _| 0.0),
         ("inverted", |load_a, _| -load_a),
@@ -92,9 +92,9 @@ fn wrong_current_is_doubted_within_seconds() {
 }
 
 #[test]
-fn repeated_reading_of_noisy_sensor_is_its_limit() {
+fn noisy_sensor_that_repeats_reading_is_at_limit() {
     let mut check = CurrentCheck::default();
-    // The reading without the noise that `drive` adds: exactly 60 A while the load is larger.
+    // If the load exceeds 60 A, the sensor reads exactly 60 A. `drive` adds noise, so the noise is subtracted here.
     let limited = |load_a: f64, time_s: u32| Some(if load_a >= 60.0 { 60.0 - noise_a(time_s) } else { load_a });
     drive(&mut check, 1200, |load_a, _| (load_a < 60.0).then_some(load_a));
     let share = drive(&mut check, 3600, limited);
@@ -103,9 +103,9 @@ fn repeated_reading_of_noisy_sensor_is_its_limit() {
 }
 
 #[test]
-fn regulated_current_of_quiet_sensor_is_no_limit() {
-    // A laboratory charges with a constant current and then at a constant voltage, which moves the current. Then it
-    // discharges with a constant current, the largest of all.
+fn quiet_sensor_with_regulated_current_stays_trusted() {
+    // A laboratory charges with a constant current. It then holds the voltage, so the current changes. The following
+    // discharge has the largest current of the test.
     let charge_then_discharge = |discharge_a: f64| {
         let mut check = CurrentCheck::default();
         for time_s in 0..600 {
@@ -121,7 +121,7 @@ fn regulated_current_of_quiet_sensor_is_no_limit() {
     };
     let of_quiet = charge_then_discharge(50.5);
     assert_eq!((of_quiet.limit.limits_a, of_quiet.is_doubtful()), ([0.0; 2], false), "{of_quiet:?}");
-    // Both directions end at the same reading: this is the limit.
+    // If charge and discharge stop at the same reading, this reading is the sensor's limit.
     let of_limited = charge_then_discharge(50.0);
     assert!(of_limited.limit.limits_a.contains(&50.0) && of_limited.is_doubtful(), "{of_limited:?}");
 }
@@ -155,7 +155,7 @@ fn jump_waits_for_explained_step() {
 }
 
 #[test]
-fn frozen_voltage_shows_against_common_path() {
+fn unchanged_voltage_is_frozen_if_others_moved() {
     let mut check = CurrentCheck::default();
     drive(&mut check, 600, |load_a, _| Some(load_a));
     let path_v = check.path_v();
