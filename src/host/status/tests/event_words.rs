@@ -42,6 +42,10 @@ fn rows() -> Vec<(Value, &'static str)> {
             "remaining life: cell 2, cycles 400, cycles high 500, cycles low 300",
         ),
         (
+            json!({ "event": "outlook", "remaining_energy_wh": 541.0, "energy_to_full_wh": 60.5 }),
+            "outlook: energy to full wh 60.5, remaining energy wh 541",
+        ),
+        (
             json!({ "event": "recharge_period", "seconds": 5000.0, "normalised_s": 5100.0, "normalised_std_s": 50.0 }),
             "recharge period: normalised 5100 ± 50 s, 5000 s",
         ),

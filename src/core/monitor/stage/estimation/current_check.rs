@@ -4,8 +4,8 @@
 //! doubtful.
 //!
 //! A *round* contains one sample of each cell, and the current of the last sample. A round is complete when all cells of
-//! the previous round have reported. If one of them is missing, the round ends when another cell reports again. A round
-//! that takes longer than [`MAX_ROUND_S`] is not compared.
+//! the previous round have reported. If one of them is missing, the round ends when another cell reports again, or after
+//! [`MAX_ROUND_S`].
 //!
 //! A step of the current moves the voltages of all cells in the opposite direction, by the resistance times the step.
 //! The check judges each clear step between two steady levels of the voltages. The step is *explained* if the current
@@ -128,6 +128,8 @@ struct Round {
 pub(crate) struct CurrentCheck {
     /// Voltage of each compared cell in the latest round (V); `None` = no reading.
     voltages_v: [Option<f64>; MAX_CELLS],
+    /// Time of the first sample of the latest round; `None` = no round.
+    began: Option<Timestamp>,
     open: OpenRound,
     /// The latest rounds, the oldest first.
     rounds: [Round; ROUNDS],
@@ -161,6 +163,7 @@ impl Default for CurrentCheck {
     fn default() -> Self {
         Self {
             voltages_v: [None; MAX_CELLS],
+            began: None,
             open: OpenRound::default(),
             rounds: [Round::default(); ROUNDS],
             count: 0,
@@ -214,7 +217,13 @@ impl CurrentCheck {
     ) {
         let mut has_samples = false;
         for (place, sample) in samples {
-            if self.open.voltages_v[place].is_some() {
+            // A cell that was missing in the round before the latest one can report after the others.
+            let is_recent = |began: Timestamp| sample.time.since(began) <= MAX_ROUND_S;
+            if self.open.began.is_none() && self.voltages_v[place].is_none() && self.began.is_some_and(is_recent) {
+                self.voltages_v[place] = Some(sample.voltage_v);
+                continue;
+            }
+            if self.open.voltages_v[place].is_some() || self.open.began.is_some_and(|began| !is_recent(began)) {
                 self.end_round(noise_v, ohm, rest_a);
             }
             self.open.add(place, sample);
@@ -229,10 +238,7 @@ impl CurrentCheck {
     fn end_round(&mut self, noise_v: f64, ohm: f64, rest_a: f64) {
         let OpenRound { voltages_v, began, time, current_a } = std::mem::take(&mut self.open);
         let before_v = std::mem::replace(&mut self.voltages_v, voltages_v);
-        if began.is_none_or(|began| time.since(began) > MAX_ROUND_S) {
-            self.count = 0;
-            return;
-        }
+        self.began = began;
         let (mut moves_v, mut moves) = ([0.0; MAX_CELLS], 0);
         // Skips cells without a reading in the previous round: their change spans more than one round.
         for (before_v, voltage_v) in before_v.into_iter().zip(voltages_v).filter_map(|(a, b)| a.zip(b)) {
@@ -337,7 +343,7 @@ impl CurrentCheck {
 
     /// Forgets the latest rounds, because the next reading comes after a pause. The evidence stays.
     pub(crate) fn interrupt(&mut self) {
-        (self.voltages_v, self.open) = ([None; MAX_CELLS], OpenRound::default());
+        (self.voltages_v, self.began, self.open) = ([None; MAX_CELLS], None, OpenRound::default());
         (self.rounds, self.count) = ([Round::default(); ROUNDS], 0);
         self.limit.pause();
     }
@@ -369,6 +375,7 @@ impl CurrentCheck {
 
     /// Shifts all timestamps by `by_nanos`, to another clock.
     pub(crate) fn rebase(&mut self, by_nanos: i64) {
+        self.began = self.began.map(|began| began.plus_nanos(by_nanos));
         self.open.began = self.open.began.map(|began| began.plus_nanos(by_nanos));
         self.open.time = self.open.time.plus_nanos(by_nanos);
         self.rounds.iter_mut().for_each(|round| round.time = round.time.plus_nanos(by_nanos));
