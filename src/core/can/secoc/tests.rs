@@ -52,6 +52,14 @@ fn authenticator_covers_data_id_data_and_freshness() {
     assert_eq!(input.bytes(), [0x01, 0x24, 1, 2, 3, 4, 1, 2, 3, 4, 5, 6, 7, 8]);
     assert_eq!(COMMAND.mac_input(&[0; 3], 0), None, "shorter than the trailer");
     assert_eq!(COMMAND.mac_input(&[0; 69], 0), None, "more data than a frame can carry");
+    assert_eq!(COMMAND.mac_input(&[0; 68], 0).unwrap().bytes().len(), 2 + 64 + 8, "the longest input");
+}
+
+#[test]
+fn profiles_serialise_with_configuration_names() {
+    for profile in Profile::ALL {
+        assert_eq!(serde_json::to_string(&profile).unwrap(), format!("\"{}\"", profile.name()));
+    }
 }
 
 #[test]
