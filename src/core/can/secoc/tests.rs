@@ -105,6 +105,16 @@ fn restart_begins_beyond_all_announced_values() {
 }
 
 #[test]
+fn start_begins_at_clock_unless_stored_value_is_higher() {
+    let by_clock = 1_700_000_000 * ANNOUNCEMENT_STEP;
+    let mut window = FreshnessWindow::default();
+    window.begin(Timestamp::from_secs(1.7e9));
+    assert_eq!(window.announced(), by_clock);
+    window.begin(Timestamp::from_secs(1.6e9));
+    assert_eq!(window.announced(), by_clock + 4096 * ANNOUNCEMENT_STEP, "the clock was set back");
+}
+
+#[test]
 fn sent_bits_wrap_but_value_does_not() {
     for profile in [Profile::P1, Profile::P3, Profile::Fd] {
         let authentication = Authentication { profile, data_id: 7 };
