@@ -185,8 +185,8 @@ fn describe(entry: &HistoryEntry) -> String {
             "{cycles:0} cycles ({cycles_low:0} to {cycles_high:0}), {days:0} days ({days_low:0} to {days_high:0})"
         }
         HistoryTable::Outlook => {
-            "{remaining_energy_wh:0} +/- {remaining_energy_std_wh:0} Wh, to full {energy_to_full_wh:0} +/- \
-             {energy_to_full_std_wh:0} Wh, energy SOH {energy_soh%1} +/- {energy_soh_std%1} %, 10 s: discharge \
+            "{remaining_energy_wh:1} +/- {remaining_energy_std_wh:1} Wh, to full {energy_to_full_wh:1} +/- \
+             {energy_to_full_std_wh:1} Wh, energy SOH {energy_soh%1} +/- {energy_soh_std%1} %, 10 s: discharge \
              {discharge_power_10s_w:0} +/- {discharge_power_10s_std_w:0} W, charge {charge_power_10s_w:0} +/- \
              {charge_power_10s_std_w:0} W"
         }
