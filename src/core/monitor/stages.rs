@@ -171,6 +171,7 @@ impl Stages {
     #[inline(never)]
     fn complete_batch(&mut self, now: Timestamp, out: &mut Outputs) {
         self.step_waiting(now, true, out);
+        self.estimation.current_check.forget_jumps();
         self.estimation.batch.begin();
         let all_fresh = self.sampling.sampler.voltages_fresh(now);
         let Self { estimation, learning, alarming, sending, .. } = self;

@@ -191,7 +191,7 @@ impl HistoryRow {
 
     /// Whether the row is a detail, which is dropped first when the backlog is full.
     pub(super) const fn is_detail(&self) -> bool {
-        matches!(self, Self::Event(EventKind::HalfCycle { .. }))
+        matches!(self, Self::Event(EventKind::HalfCycle { .. } | EventKind::Outlook { .. }))
     }
 
     /// The identity of the connected pack, if this row contains it.

@@ -142,6 +142,10 @@ mod tests {
                 "address = 'http://10.0.0.1:1'\ntoken_file = '/t'",
                 "kuksa.token_file: without TLS the token could be read on the network",
             ),
+            (
+                "address = 'http://127.0.0.1:80@evil:1'\ntoken_file = '/t'",
+                "kuksa.token_file: without TLS the token could be read on the network",
+            ),
             ("branch = 'Vehicle.Powertrain.TractionBattery'", "kuksa.branch"),
             ("branch = 'Vehicle.private'", "kuksa.branch"),
             ("branch = 'Vehicle..A'", "kuksa.branch"),

@@ -157,6 +157,7 @@ impl Estimation {
         self.progress.fill(CellProgress::default());
         self.trusted.fill(true);
         self.all_trusted = true;
+        self.current_check.interrupt();
         self.begin_checks();
     }
 
@@ -210,11 +211,7 @@ impl Estimation {
         let rest_a = self.bank.own_config().gap.rest_current_a;
         let is_rest = |sample: &CellSample| sample.current_a.is_some_and(|a| a != 0.0 && a.abs() <= rest_a);
         let has_jumped = |sample: &&CellSample| self.bank.result(sample.cell.index()).jumped && !is_rest(sample);
-        let jumped = samples.iter().filter(has_jumped).count();
-        self.batch.jumped += jumped;
-        if jumped > 0 && 2 * self.batch.jumped > self.progress.len() {
-            self.current_check.demand_step();
-        }
+        self.current_check.note_jumps(samples.iter().filter(has_jumped).count(), self.progress.len());
         self.check_models(&samples);
         if modelling.has_row() {
             modelling.close_row(self.mean_soc());
@@ -466,6 +463,7 @@ impl Estimation {
 
     /// Handles a gap of unknown length. Charge is not counted across the gap.
     pub(crate) fn handle_unknown_gap(&mut self) {
+        self.current_check.interrupt();
         self.bank.change_all(|_, cell| cell.handle_unknown_gap());
         self.progress.iter_mut().for_each(|cell| cell.consumed = None);
     }

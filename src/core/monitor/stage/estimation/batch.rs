@@ -14,19 +14,17 @@ pub(crate) struct CellBatch {
     pub(crate) waiting: Vec<CellSample>,
     has_reported: Vec<bool>,
     pub(crate) reported: usize,
-    /// Number of cells whose SOC has jumped in this batch.
-    pub(crate) jumped: usize,
 }
 
 impl CellBatch {
     pub(crate) fn new(cells: usize) -> Self {
-        Self { waiting: Vec::with_capacity(cells), has_reported: vec![false; cells], reported: 0, jumped: 0 }
+        Self { waiting: Vec::with_capacity(cells), has_reported: vec![false; cells], reported: 0 }
     }
 
     /// Restores a stored batch.
     pub(crate) fn restore(has_reported: Vec<bool>, waiting: Vec<CellSample>) -> Self {
         let reported = has_reported.iter().filter(|&&reported| reported).count();
-        Self { waiting, has_reported, reported, jumped: 0 }
+        Self { waiting, has_reported, reported }
     }
 
     pub(crate) fn has_reported(&self, cell: usize) -> bool {
@@ -57,6 +55,6 @@ impl CellBatch {
     pub(crate) fn begin(&mut self) {
         debug_assert!(self.waiting.is_empty(), "{} samples without their step", self.waiting.len());
         self.has_reported.fill(false);
-        (self.reported, self.jumped) = (0, 0);
+        self.reported = 0;
     }
 }

@@ -3,9 +3,9 @@
 //! In: samples of the compared cells, and the series resistance according to the model. Out: whether the current is
 //! doubtful.
 //!
-//! A *round* contains one sample of each cell, and the current of the last sample. A round is complete when all cells of
-//! the previous round have reported. If one of them is missing, the round ends when another cell reports again, or after
-//! [`MAX_ROUND_S`].
+//! A *round* contains one sample of each cell, and the mean current of these samples. A round is complete when all cells
+//! of the previous round have reported. If one of them is missing, the round ends when another cell reports again, after
+//! a pause ([`PAUSE_SHARE`]) or after [`MAX_ROUND_S`].
 //!
 //! A step of the current moves the voltages of all cells in the opposite direction, by the resistance times the step.
 //! The check judges each clear step between two steady levels of the voltages. The step is *explained* if the current
@@ -69,6 +69,9 @@ const RATIO_GAIN: f64 = 0.1;
 /// Longest time from the first to the last sample of a round (s). In a longer round, the cells were read at different
 /// currents.
 const MAX_ROUND_S: f64 = 1.0;
+/// A pause of this share of the time between the beginnings of two rounds ends a round: the frames of the next round
+/// follow.
+const PAUSE_SHARE: f64 = 0.75;
 /// Longest time between two rounds (s). After a longer pause, the steps are not compared.
 const MAX_PAUSE_S: f64 = 60.0;
 /// Part of the earlier doubts that remains after an explained step.
@@ -96,14 +99,20 @@ struct OpenRound {
     /// Time of the latest sample.
     time: Timestamp,
     /// Current of the latest sample (A); `None` = unknown.
-    current_a: Option<f64>,
+    latest_a: Option<f64>,
+    /// Sum and number of the known currents of the samples (A).
+    sum_a: f64,
+    known: u32,
 }
 
 impl OpenRound {
     fn add(&mut self, place: usize, sample: &CellSample) {
         self.voltages_v[place] = Some(sample.voltage_v);
         self.began.get_or_insert(sample.time);
-        (self.time, self.current_a) = (sample.time, sample.current_a);
+        (self.time, self.latest_a) = (sample.time, sample.current_a);
+        if let Some(current_a) = sample.current_a {
+            (self.sum_a, self.known) = (self.sum_a + current_a, self.known + 1);
+        }
     }
 
     fn has_all_of(&self, others: &[Option<f64>; MAX_CELLS]) -> bool {
@@ -116,8 +125,11 @@ impl OpenRound {
 #[serde(deny_unknown_fields)]
 struct Round {
     time: Timestamp,
-    /// Current of a cell (A).
+    /// Mean current of a cell (A).
     current_a: f64,
+    /// Latest current of a cell (A).
+    #[serde(default)]
+    latest_a: f64,
     /// Common change of the voltages since the previous round (V).
     move_v: f64,
 }
@@ -129,7 +141,9 @@ pub(crate) struct CurrentCheck {
     /// Voltage of each compared cell in the latest round (V); `None` = no reading.
     voltages_v: [Option<f64>; MAX_CELLS],
     /// Time of the first sample of the latest round; `None` = no round.
+    #[serde(default)]
     began: Option<Timestamp>,
+    #[serde(default)]
     open: OpenRound,
     /// The latest rounds, the oldest first.
     rounds: [Round; ROUNDS],
@@ -153,6 +167,9 @@ pub(crate) struct CurrentCheck {
     limit: SensorLimit,
     /// Number of earlier doubts; explained steps reduce it.
     doubts: f64,
+    /// Number of cells whose SOC has jumped since all cells last reported.
+    #[serde(default)]
+    jumped: usize,
     /// Whether a jump of the SOC in a downtime waits for an explained step.
     is_unconfirmed: bool,
     /// Whether the current was contradicted and has still not flowed in both directions.
@@ -176,6 +193,7 @@ impl Default for CurrentCheck {
             resolution_v: COARSE_V,
             limit: SensorLimit::default(),
             doubts: 0.0,
+            jumped: 0,
             is_unconfirmed: false,
             is_one_sided: false,
         }
@@ -196,8 +214,22 @@ impl CurrentCheck {
     /// Handles a jump of the SOC in a downtime: the cells may have been used, or a sensor may have failed. The SOC
     /// stays unconfirmed until a step of the current is explained. If no step has ever been judged, the SOC counts as
     /// confirmed.
-    pub(crate) fn demand_step(&mut self) {
+    fn demand_step(&mut self) {
         self.is_unconfirmed = self.steps != FIRST_STEPS;
+    }
+
+    /// Notes that the SOC of `count` cells has jumped. If it has jumped in more than half of all `cells` since all cells
+    /// last reported, demands a step.
+    pub(crate) fn note_jumps(&mut self, count: usize, cells: usize) {
+        self.jumped = self.jumped.saturating_add(count);
+        if count > 0 && 2 * self.jumped.min(cells) > cells {
+            self.demand_step();
+        }
+    }
+
+    /// Forgets the jumps, because all cells have reported.
+    pub(crate) fn forget_jumps(&mut self) {
+        self.jumped = 0;
     }
 
     /// Whether the SOC has jumped in a downtime, and no step of the current has been explained since.
@@ -218,12 +250,17 @@ impl CurrentCheck {
         let mut has_samples = false;
         for (place, sample) in samples {
             // A cell that was missing in the round before the latest one can report after the others.
-            let is_recent = |began: Timestamp| sample.time.since(began) <= MAX_ROUND_S;
+            let is_recent = |began: Timestamp| (0.0..MAX_ROUND_S).contains(&sample.time.since(began));
             if self.open.began.is_none() && self.voltages_v[place].is_none() && self.began.is_some_and(is_recent) {
                 self.voltages_v[place] = Some(sample.voltage_v);
                 continue;
             }
-            if self.open.voltages_v[place].is_some() || self.open.began.is_some_and(|began| !is_recent(began)) {
+            let has_paused = |began: Timestamp| {
+                let cycle_s = self.began.map_or(f64::INFINITY, |before| began.since(before));
+                sample.time.since(self.open.time) > PAUSE_SHARE * cycle_s
+            };
+            let has_ended = |began: Timestamp| !is_recent(began) || has_paused(began);
+            if self.open.voltages_v[place].is_some() || self.open.began.is_some_and(has_ended) {
                 self.end_round(noise_v, ohm, rest_a);
             }
             self.open.add(place, sample);
@@ -236,7 +273,7 @@ impl CurrentCheck {
 
     /// Ends the open round and compares it with the rounds before it.
     fn end_round(&mut self, noise_v: f64, ohm: f64, rest_a: f64) {
-        let OpenRound { voltages_v, began, time, current_a } = std::mem::take(&mut self.open);
+        let OpenRound { voltages_v, began, time, latest_a, sum_a, known } = std::mem::take(&mut self.open);
         let before_v = std::mem::replace(&mut self.voltages_v, voltages_v);
         self.began = began;
         let (mut moves_v, mut moves) = ([0.0; MAX_CELLS], 0);
@@ -253,8 +290,9 @@ impl CurrentCheck {
         if moves > 1 {
             self.scatter_v += SCATTER_GAIN * (scatter(&mut moves_v[..moves], move_v) - self.scatter_v);
         }
-        let is_late = self.count > 0 && time.since(self.rounds[ROUNDS - 1].time) > MAX_PAUSE_S;
-        let Some(current_a) = current_a.filter(|_| !is_late && moves > 0) else {
+        // If the clock was set back, the time between the rounds is unknown.
+        let is_late = self.count > 0 && !(0.0..=MAX_PAUSE_S).contains(&time.since(self.rounds[ROUNDS - 1].time));
+        let Some(latest_a) = latest_a.filter(|_| !is_late && moves > 0) else {
             self.count = 0;
             if is_late {
                 self.limit.pause();
@@ -262,14 +300,15 @@ impl CurrentCheck {
             return;
         };
         self.rounds.rotate_left(1);
-        self.rounds[ROUNDS - 1] = Round { time, current_a, move_v };
+        let current_a = sum_a / f64::from(known);
+        self.rounds[ROUNDS - 1] = Round { time, current_a, latest_a, move_v };
         self.count = (self.count + 1).min(ROUNDS);
         if self.count == ROUNDS {
             self.judge(noise_v, ohm * libm::exp(self.log_ratio));
         }
         if self.count >= 2 {
             let is_steady = move_v.abs() <= self.usual_v.max(self.resolution_v);
-            let evidence = self.limit.judge(self.rounds[ROUNDS - 2].current_a, current_a, is_steady);
+            let evidence = self.limit.judge(self.rounds[ROUNDS - 2].latest_a, latest_a, is_steady);
             self.add_evidence(evidence);
         }
         self.is_one_sided = !self.limit.has_seen_both(rest_a) && (self.is_one_sided || self.is_contradicted());
@@ -352,7 +391,9 @@ impl CurrentCheck {
     pub(crate) fn check(&self) -> Result<(), InvalidState> {
         let voltages_v = self.voltages_v.into_iter().chain(self.open.voltages_v).flatten();
         bounds::VOLTAGE_V.check_all("a voltage of the check of the current", voltages_v)?;
-        let currents_a = self.rounds.iter().map(|round| round.current_a).chain(self.open.current_a);
+        let OpenRound { latest_a, sum_a, .. } = self.open;
+        bounds::NUMBER.check_all("a current of the check of the current", [sum_a])?;
+        let currents_a = self.rounds.iter().flat_map(|round| [round.current_a, round.latest_a]).chain(latest_a);
         bounds::CURRENT_A.check_all("a current of the check of the current", currents_a)?;
         let numbers = self.rounds.map(|round| round.move_v);
         bounds::NUMBER.check_all("a voltage step of the check of the current", numbers)?;

@@ -182,10 +182,78 @@ fn round_that_takes_seconds_is_not_compared() {
     let mut check = CurrentCheck::default();
     for time_s in (0..3600).step_by(4) {
         let mut samples = drive_samples(time_s, |load_a, _| Some(-load_a));
-        samples[CELLS - 1].time = Timestamp::from_secs(f64::from(time_s + 2));
+        samples[CELLS - 1].time = Timestamp::from_secs(f64::from(time_s) + 1.1);
         handle(&mut check, &samples);
     }
     assert_eq!((check.is_doubtful(), check.path_v()), (false, 0.0));
+}
+
+/// Runs 1800 rounds of a cycle of `cycle_ms`, in which each cell reports `apart_ms` after the previous one. `is_lost`
+/// tells whether a sample is lost: by round and cell. Returns the share of rounds in doubt.
+fn spread_drive((cycle_ms, apart_ms): (u32, u32), sign: f64, factor: f64, is_lost: impl Fn(u32, u32) -> bool) -> f64 {
+    let (mut check, mut doubtful) = (CurrentCheck::default(), 0);
+    for round in 0..1800 {
+        for cell in (0..CELLS as u32).filter(|cell| !is_lost(round, *cell)) {
+            let ms = round * cycle_ms + cell * apart_ms;
+            let time = Timestamp::from_nanos(i64::from(ms) * 1_000_000);
+            let load_a = load_a((ms / 1000).max(1));
+            let mut sample = samples(0, Some(sign * load_a), |_| 3.7 - factor * OHM * load_a)[cell as usize];
+            (sample.time, sample.voltage_v) = (time, sample.voltage_v + 1e-4 * f64::from((round + cell) % 5));
+            handle(&mut check, &[sample]);
+        }
+        doubtful += u32::from(check.is_doubtful());
+    }
+    f64::from(doubtful) / 1800.0
+}
+
+#[test]
+fn round_stays_whole_after_lost_sample() {
+    for cycle_ms in [200, 500, 1000, 1900] {
+        let one_lost = |round: u32, cell: u32| round == 1 && cell == 0;
+        let many_lost = |round: u32, cell: u32| (7 * round + 3 * cell) % 23 == 0;
+        let starts_late = |round: u32, cell: u32| round == 0 && cell < 3;
+        let losses: [&dyn Fn(u32, u32) -> bool; 4] = [&|_, _| false, &one_lost, &many_lost, &starts_late];
+        for (case, is_lost) in losses.into_iter().enumerate() {
+            let share = |sign: f64| spread_drive((cycle_ms, 5), sign, 1.2, is_lost);
+            assert_eq!(share(1.0), 0.0, "a good sensor, cycle {cycle_ms} ms, case {case}");
+            assert!(share(-1.0) > 0.7, "{}: an inverted sensor, cycle {cycle_ms} ms, case {case}", share(-1.0));
+        }
+    }
+}
+
+#[test]
+fn good_current_is_trusted_if_cells_report_over_whole_cycle() {
+    for (cycle_ms, apart_ms) in [(500, 100), (900, 180), (2000, 400), (5000, 1000)] {
+        for factor in [0.7, 1.2, 2.0] {
+            assert_eq!(spread_drive((cycle_ms, apart_ms), 1.0, factor, |_, _| false), 0.0, "{cycle_ms} ms, {factor}");
+        }
+    }
+}
+
+#[test]
+fn clock_set_back_between_rounds_is_no_step() {
+    let mut check = CurrentCheck::default();
+    drive(&mut check, 600, |load_a, _| Some(load_a));
+    for k in 0..20_u32 {
+        let voltage_v = if k < 10 { 3.7 } else { 4.1 };
+        round(&mut check, if k < 10 { 5000 + 2 * k } else { 1000 + 2 * k }, Some(10.0), |_| voltage_v);
+    }
+    assert!(!check.is_doubtful(), "{check:?}");
+}
+
+#[test]
+fn jumps_of_most_cells_demand_step() {
+    let mut check = CurrentCheck::default();
+    drive(&mut check, 600, |load_a, _| Some(load_a));
+    for _ in 0..5 {
+        check.note_jumps(4, 40);
+    }
+    assert!(!check.is_unconfirmed(), "20 of 40 cells");
+    check.forget_jumps();
+    for part in [12, 0, 8, 1] {
+        check.note_jumps(part, 40);
+    }
+    assert!(check.is_unconfirmed(), "21 of 40 cells");
 }
 
 #[test]
