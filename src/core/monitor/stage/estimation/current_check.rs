@@ -106,6 +106,10 @@ struct OpenRound {
 }
 
 impl OpenRound {
+    fn is_empty(&self) -> bool {
+        self.began.is_none()
+    }
+
     fn add(&mut self, place: usize, sample: &CellSample) {
         self.voltages_v[place] = Some(sample.voltage_v);
         self.began.get_or_insert(sample.time);
@@ -143,7 +147,7 @@ pub(crate) struct CurrentCheck {
     /// Time of the first sample of the latest round; `None` = no round.
     #[serde(default)]
     began: Option<Timestamp>,
-    #[serde(default)]
+    #[serde(default, skip_serializing_if = "OpenRound::is_empty")]
     open: OpenRound,
     /// The latest rounds, the oldest first.
     rounds: [Round; ROUNDS],

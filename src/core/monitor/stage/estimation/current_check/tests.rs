@@ -210,7 +210,7 @@ fn spread_drive((cycle_ms, apart_ms): (u32, u32), sign: f64, factor: f64, is_los
 fn round_stays_whole_after_lost_sample() {
     for cycle_ms in [200, 500, 1000, 1900] {
         let one_lost = |round: u32, cell: u32| round == 1 && cell == 0;
-        let many_lost = |round: u32, cell: u32| (7 * round + 3 * cell) % 23 == 0;
+        let many_lost = |round: u32, cell: u32| (7 * round + 3 * cell).is_multiple_of(23);
         let starts_late = |round: u32, cell: u32| round == 0 && cell < 3;
         let losses: [&dyn Fn(u32, u32) -> bool; 4] = [&|_, _| false, &one_lost, &many_lost, &starts_late];
         for (case, is_lost) in losses.into_iter().enumerate() {
