@@ -25,7 +25,7 @@ const FORMATS: [NamedValue<TableFormat>; 2] = [
 /// Arguments of `export`.
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "Writes DIR/NAME/estimates, half_cycles, alarms and use_record (.parquet or .csv) and about.json for each log. To query all logs: \
+    after_help = "Writes DIR/NAME/estimates, half_cycles, outlook, alarms and use_record (.parquet or .csv) and about.json for each log. To query all logs: \
     select log, cell, min(capacity_ah) from 'DIR/*/half_cycles.parquet' group by log, cell. Existing tables are replaced when the \
     new ones are complete. If a log fails, its tables are not replaced, the other logs continue, and the exit code is 1. Sections of a \
     CSV get their times from --start-times, else from NAME_cycles.csv next to the CSV."

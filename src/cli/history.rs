@@ -82,11 +82,12 @@ struct RowArgs {
 }
 
 /// Kinds of rows by name.
-const KINDS: [NamedValue<HistoryTable>; 7] = [
+const KINDS: [NamedValue<HistoryTable>; 8] = [
     ("half-cycle", HistoryTable::HalfCycle, "Charges and discharges"),
     ("capacity", HistoryTable::Capacity, "Learned capacities"),
     ("loss-modes", HistoryTable::LossModes, "Lost lithium and active material of cells"),
     ("remaining-life", HistoryTable::RemainingLife, "Remaining life of the cell that reaches its end of life first"),
+    ("outlook", HistoryTable::Outlook, "Energy and power of the pack"),
     ("model", HistoryTable::Model, "Changes of the cell model learned on board"),
     ("alarm", HistoryTable::Alarm, "Alarms"),
     ("reset", HistoryTable::Reset, "Resets, pack replacements, damaged files"),
@@ -182,6 +183,12 @@ fn describe(entry: &HistoryEntry) -> String {
         HistoryTable::RemainingLife if value("cycles").is_null() => "no longer known",
         HistoryTable::RemainingLife => {
             "{cycles:0} cycles ({cycles_low:0} to {cycles_high:0}), {days:0} days ({days_low:0} to {days_high:0})"
+        }
+        HistoryTable::Outlook => {
+            "{remaining_energy_wh:1} +/- {remaining_energy_std_wh:1} Wh, to full {energy_to_full_wh:1} +/- \
+             {energy_to_full_std_wh:1} Wh, energy SOH {energy_soh%1} +/- {energy_soh_std%1} %, 10 s: discharge \
+             {discharge_power_10s_w:0} +/- {discharge_power_10s_std_w:0} W, charge {charge_power_10s_w:0} +/- \
+             {charge_power_10s_std_w:0} W"
         }
         HistoryTable::Model => {
             let back = if value("taken_back").as_i64() == Some(1) { ", the previous model applies again" } else { "" };

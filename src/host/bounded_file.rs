@@ -50,8 +50,8 @@ pub fn read(path: &Path) -> io::Result<Vec<u8>> {
 /// Reads a regular file or a pipe of at most `max_bytes`.
 ///
 /// # Errors
-/// Fails if the path is a folder or a device, if it cannot be read, if it is longer, or if a pipe stays without data for
-/// 10 s.
+/// Fails if the path is a folder or a device, if it cannot be read, if it has more bytes, or if the writer of a pipe
+/// sends no data for 10 s. A pipe without a writer is empty.
 pub fn read_up_to(path: &Path, max_bytes: u64) -> io::Result<Vec<u8>> {
     let file = open_any(path)?;
     let kind = file.metadata()?.file_type();

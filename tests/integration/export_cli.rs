@@ -79,6 +79,13 @@ fn exported_half_cycles_and_alarms_match_replay() {
     assert_eq!(bench.csv("out/life/alarms.csv").len(), of("alarm").len());
     let rows = bench.csv("out/life/half_cycles.csv");
     assert_eq!((rows.len(), rows.len()), (of("half_cycle").len(), of("capacity").len()));
+    let outlooks = bench.csv("out/life/outlook.csv");
+    assert_eq!((outlooks.len(), of("half_cycle").len()), (of("outlook").len(), of("outlook").len()));
+    for (row, outlook) in outlooks.iter().zip(of("outlook")) {
+        for column in ["remaining_energy_wh", "energy_to_full_std_wh", "energy_soh", "charge_power_10s_w"] {
+            assert_eq!(row[column].parse::<f64>().ok(), outlook[column].as_f64(), "{column}");
+        }
+    }
     let mut known = 0;
     for (row, capacity) in rows.iter().zip(of("capacity")) {
         assert_eq!(row["capacity_ah"].parse::<f64>().unwrap(), capacity["capacity_ah"].as_f64().unwrap());
@@ -176,7 +183,7 @@ fn failed_log_leaves_no_table_others_continue() {
     let printed = bench.run(&["export", "--strict", "--out", "out", "bad.log", "life.log", "none.log"]).code(1);
     let stderr = String::from_utf8_lossy(&printed.get_output().stderr).into_owned();
     assert!(stderr.contains("bad.log:1:") && stderr.contains("none.log: cannot be read"), "{stderr}");
-    assert_eq!(fs::read_dir(bench.path("out/life")).unwrap().count(), 5);
+    assert_eq!(fs::read_dir(bench.path("out/life")).unwrap().count(), 6);
     for name in ["bad", "none"] {
         assert_eq!(fs::read_dir(bench.path("out").join(name)).unwrap().count(), 0, "{name}");
     }

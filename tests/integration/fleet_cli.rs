@@ -15,7 +15,7 @@ use parquet::file::reader::{FileReader, SerializedFileReader};
 use parquet::record::RowAccessor;
 use serde_json::Value;
 
-const TABLES: [&str; 5] = ["vehicles", "half_cycles", "alarms", "use_record", "estimates"];
+const TABLES: [&str; 6] = ["vehicles", "half_cycles", "outlook", "alarms", "use_record", "estimates"];
 
 struct Fleet {
     folder: tempfile::TempDir,

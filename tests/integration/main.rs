@@ -86,6 +86,7 @@ mod rul;
 mod sample_measured;
 mod score_cli;
 mod simulate_cli;
+mod spread_rounds;
 mod store_cli;
 mod support;
 mod tables;

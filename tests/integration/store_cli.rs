@@ -193,5 +193,5 @@ fn missing_or_foreign_history_is_reported() {
     bytes[60..64].copy_from_slice(&99_u32.to_be_bytes());
     fs::write(place.database(), bytes).expect("written");
     let printed = bad(&["history", "--state", &place.state()]);
-    assert!(printed.contains("format 99, must be 2"), "{printed}");
+    assert!(printed.contains("format 99, must be 3"), "{printed}");
 }

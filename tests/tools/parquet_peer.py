@@ -39,7 +39,7 @@ def same(value, text):
 
 
 def main(parquet_folder, csv_folder):
-    for name in ["estimates", "half_cycles", "alarms"]:
+    for name in ["estimates", "half_cycles", "outlook", "alarms"]:
         try:
             names, rows = read(Path(parquet_folder) / f"{name}.parquet")
         except ImportError:

@@ -1,4 +1,4 @@
-//! Writes a candump log, also compressed.
+//! Writes a candump log, plain or compressed.
 
 use std::io::{self, Write};
 use std::path::Path;

@@ -98,7 +98,7 @@ fn pack(text: &mut String, document: &StatusDocument) {
     );
     if pack.values.get(Quantity::CurrentOffset).is_some() {
         let offset = with_std(&pack.values, Quantity::CurrentOffset, 3);
-        let _ = writeln!(text, "offset     current sensor {offset} (reading less true current)");
+        let _ = writeln!(text, "offset     current sensor {offset} (reading minus true current)");
     }
     if let Some(state) = pack.model_state.filter(|state| *state != ModelState::Given) {
         let better = pack.model_fits_better.map_or_else(String::new, |it| format!(": {} fits better", it.name()));
@@ -183,7 +183,7 @@ fn interfaces(text: &mut String, document: &StatusDocument) {
     };
     let _ = writeln!(
         text,
-        "counted    {} readings used, {rejected} rejected; {} late ticks; 99 % of estimates within {slowest}",
+        "counted    {} readings used, {rejected} rejected; {} late ticks; 99 % of frames processed within {slowest}",
         readings.accepted, service.missed_deadlines,
     );
     let _ = writeln!(text, "store      {}", store(document));

@@ -16,7 +16,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::cell::model_bands::CURVE_C;
-use crate::cell::{CellModel, GridPosition, MAX_BRANCHES, USUAL_LOAD_PER_H};
+use crate::cell::{CellModel, GridPosition, MAX_BRANCHES, TemperaturePosition, USUAL_LOAD_PER_H};
 use crate::filter::{ScalarGaussian, bisect, square};
 use crate::quantity::{CellIndex, InvalidState, Mode, Timestamp};
 
@@ -24,7 +24,8 @@ use crate::quantity::{CellIndex, InvalidState, Mode, Timestamp};
 pub const POWER_S: [f64; 3] = [2.0, 10.0, 30.0];
 /// Time over which the load of a discharge is averaged (s). Over half an hour, fast and slow parts of a drive mix.
 const LOAD_S: f64 = 1800.0;
-/// Standard deviation of ln(time that the charger holds the voltage). Models without a slow branch taper too fast.
+/// Standard deviation of ln(charging time that the taper adds). It is large, because the current of a model without a slow
+/// branch falls too fast.
 const LOG_HELD_STD: f64 = 0.7;
 /// A load is known if its mean is at least this share of its RMS value. If the mean is smaller, charge and discharge
 /// alternate, as in a hybrid, and no time to empty can be forecast.
@@ -76,11 +77,11 @@ pub struct RecentLoad {
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Average {
-    /// Time that the average contains, at most the time of averaging (s).
+    /// Time that the average covers so far, at most its window (s).
     seconds: f64,
     mean_a: f64,
     mean_square_a2: f64,
-    /// Largest current; it decays to the mean with the time of averaging (A).
+    /// Largest recent current (A). It decays towards the mean with the time constant of the window.
     peak_a: f64,
 }
 
@@ -106,7 +107,8 @@ impl Average {
 }
 
 impl RecentLoad {
-    /// Adds the current of a cell at `now`; `None` = the current is unknown. A current up to `rest_a` is no load.
+    /// Adds the current of a cell at `now`; `None` = the current is unknown. If the mode is rest or unknown, a current of at
+    /// most `rest_a` is not averaged.
     pub fn observe(&mut self, now: Timestamp, mode: Mode, current_a: Option<f64>, rest_a: f64) {
         let seconds = self.latest.map_or(0.0, |latest| now.since(latest));
         self.latest = Some(now);
@@ -114,7 +116,7 @@ impl RecentLoad {
         match mode {
             Mode::Charge => self.charge.add(-current_a, seconds, CHARGER_S),
             Mode::Rest | Mode::Unknown if current_a.abs() <= rest_a => self.charge = Average::default(),
-            // A current that changes its sign within seconds gives no mode, but still counts as load.
+            // If the current changes its sign every few seconds, the mode is unknown. The current still counts as load.
             Mode::Discharge | Mode::Rest | Mode::Unknown => {
                 self.charge = Average::default();
                 self.discharge.add(current_a, seconds, LOAD_S);
@@ -122,7 +124,7 @@ impl RecentLoad {
         }
     }
 
-    /// Notes that the current before the next one is unknown, after a sleep or a restart.
+    /// After a sleep or a restart: forgets the time of the latest current, so that the pause is not averaged.
     pub fn interrupt(&mut self) {
         self.latest = None;
     }
@@ -169,8 +171,8 @@ impl Load {
         Self { peak_a: rated_ah, ..Self::constant(USUAL_LOAD_PER_H * rated_ah) }
     }
 
-    /// Voltage that is lost per charge (V): by the mean current in the settled circuit, and by its fluctuations in the
-    /// circuit's first response.
+    /// Energy lost per charge (V). The mean current meets the settled resistance, the fluctuations of the current meet the
+    /// fast resistance.
     fn loss_v(&self, settled_ohm: f64, fast_ohm: f64) -> f64 {
         let fluctuation_a = (self.mean_square_a2 - square(self.mean_a)) / self.mean_a;
         self.mean_a * settled_ohm + fluctuation_a * fast_ohm
@@ -196,14 +198,16 @@ pub struct CellNow<'a> {
     pub soc: ScalarGaussian,
     /// Capacity (Ah).
     pub capacity: ScalarGaussian,
-    /// ln of the resistance relative to the model, with the model's own error at this SOC and temperature.
-    pub log_resistance: ScalarGaussian,
+    /// Resistance relative to the model.
+    pub resistance_ratio: f64,
+    /// Standard deviation of its logarithm, with the model's own error at this SOC and temperature.
+    pub log_resistance_std: f64,
     /// Additional resistance ratio of the slowest branch.
     pub slow_ratio: f64,
     /// Voltages of the branches (V).
     pub branch_v: [f64; MAX_BRANCHES],
-    /// Temperature (degrees C).
-    pub temperature_c: f64,
+    /// Position of the temperature in the model's tables.
+    pub temperature: TemperaturePosition,
 }
 
 /// Direction of a current.
@@ -223,34 +227,48 @@ impl CellNow<'_> {
     }
 
     fn position(&self, soc: f64) -> GridPosition {
-        self.model.grid_position(soc, self.temperature_c)
+        self.model.grid_position_at(&self.temperature, soc)
     }
 
-    fn ocv_v(&self, soc: f64) -> f64 {
-        self.model.aged_ocv_v(&self.position(soc), self.capacity.mean)
+    fn ocv_v(&self, at: &GridPosition) -> f64 {
+        self.model.aged_ocv_v(at, self.capacity.mean)
     }
 
     /// Resistance (ohm) `after_s` after a step of the current.
-    fn ohm(&self, soc: f64, after_s: f64) -> f64 {
-        let (model, position) = (self.model, self.position(soc));
+    fn ohm(&self, at: &GridPosition, after_s: f64) -> f64 {
+        self.resistance(at, |tau_s| 1.0 - libm::exp(-after_s / tau_s))
+    }
+
+    /// Resistance (ohm) of the settled circuit.
+    fn settled_ohm(&self, at: &GridPosition) -> f64 {
+        self.resistance(at, |_| 1.0)
+    }
+
+    /// Resistance (ohm) with the share of each branch that `share` gives for its time constant.
+    fn resistance(&self, at: &GridPosition, share: impl Fn(f64) -> f64) -> f64 {
+        let model = self.model;
         let slowest = model.branches.len() - 1;
         let response = |i: usize| {
             let ratio = if i == slowest { self.slow_ratio } else { 1.0 };
-            ratio * model.branch_r_ohm(i, &position) * (1.0 - libm::exp(-after_s / model.branch_tau_s(i, &position)))
+            ratio * model.branch_r_ohm(i, at) * share(model.branch_tau_s(i, at))
         };
-        libm::exp(self.log_resistance.mean) * (0..=slowest).fold(model.r0_ohm(&position), |sum, i| sum + response(i))
+        self.resistance_ratio * (0..=slowest).fold(model.r0_ohm(at), |sum, i| sum + response(i))
     }
 
     /// Mean voltage at a load (V), at least the lowest voltage.
     fn loaded_v(&self, soc: f64, load: &Load, config: &OutlookConfig) -> f64 {
-        let loss_v = load.loss_v(self.ohm(soc, f64::INFINITY), self.ohm(soc, POWER_S[1]));
-        (self.ocv_v(soc) - loss_v).max(self.min_v(config))
+        let at = &self.position(soc);
+        let loss_v = load.loss_v(self.settled_ohm(at), self.ohm(at, POWER_S[1]));
+        (self.ocv_v(at) - loss_v).max(self.min_v(config))
     }
 
     /// SOC at which the voltage at the largest current of the load falls to the lowest voltage.
     fn empty_soc(&self, load: &Load, config: &OutlookConfig) -> f64 {
-        let peak_v = |soc: f64| load.peak_v(self.ohm(soc, f64::INFINITY), self.ohm(soc, POWER_S[0]));
-        let is_empty = |soc: f64| self.ocv_v(soc) - peak_v(soc) < self.min_v(config);
+        let is_empty = |soc: f64| {
+            let at = &self.position(soc);
+            let peak_v = load.peak_v(self.settled_ohm(at), self.ohm(at, POWER_S[0]));
+            self.ocv_v(at) - peak_v < self.min_v(config)
+        };
         if is_empty(0.0) { bisect((0.0, 1.0), HALVINGS, is_empty).1 } else { 0.0 }
     }
 
@@ -269,7 +287,8 @@ impl CellNow<'_> {
 
     /// Charging current (A) that keeps the cell at its highest voltage.
     fn held_a(&self, soc: f64, config: &OutlookConfig) -> f64 {
-        (self.max_v(config) - self.ocv_v(soc)) / self.ohm(soc, f64::INFINITY)
+        let at = &self.position(soc);
+        (self.max_v(config) - self.ocv_v(at)) / self.settled_ohm(at)
     }
 
     /// Energy (Wh) that the cell delivers with the charge `charge_ah` at this load.
@@ -281,8 +300,8 @@ impl CellNow<'_> {
     /// Energy (Wh) that the cell takes up with the charge `charge_ah` at a constant current.
     fn taken_wh(&self, charge_ah: f64, current_a: f64, config: &OutlookConfig) -> f64 {
         let at = |part: f64| {
-            let soc = self.soc.mean + part * charge_ah / self.capacity.mean;
-            (self.ocv_v(soc) + current_a * self.ohm(soc, f64::INFINITY)).min(self.max_v(config))
+            let at = &self.position(self.soc.mean + part * charge_ah / self.capacity.mean);
+            (self.ocv_v(at) + current_a * self.settled_ohm(at)).min(self.max_v(config))
         };
         charge_ah * mean_of(at)
     }
@@ -301,12 +320,13 @@ impl CellNow<'_> {
     /// Open-circuit voltage less the relaxing branches (V), and resistance (ohm), `after_s` after the current has
     /// changed to `current_a`, positive = discharge.
     fn response(&self, current_a: f64, after_s: f64) -> (f64, f64) {
-        let (model, position) = (self.model, self.position(self.soc.mean));
+        let (model, now) = (self.model, &self.position(self.soc.mean));
         let moved = current_a * after_s / (3600.0 * self.capacity.mean);
+        let [middle, end] = [0.5, 1.0].map(|part| self.position(self.soc.mean - part * moved));
         let relaxing_v = (0..model.branches.len())
-            .map(|i| self.branch_v[i] * libm::exp(-after_s / model.branch_tau_s(i, &position)))
+            .map(|i| self.branch_v[i] * libm::exp(-after_s / model.branch_tau_s(i, now)))
             .sum::<f64>();
-        (self.ocv_v(self.soc.mean - moved) - relaxing_v, self.ohm(self.soc.mean - 0.5 * moved, after_s))
+        (self.ocv_v(&end) - relaxing_v, self.ohm(&middle, after_s))
     }
 
     /// Largest current (A, positive) in a direction that keeps the cell within its limits for `for_s`.
@@ -351,7 +371,7 @@ impl CellNow<'_> {
                 let capacity_ah = cell.capacity.mean + sigmas * cell.capacity.std();
                 cell.capacity.mean = capacity_ah.max(0.1 * cell.capacity.mean);
             })
-            + part(|cell, sigmas| cell.log_resistance.mean += sigmas * cell.log_resistance.std());
+            + part(|cell, sigmas| cell.resistance_ratio *= libm::exp(sigmas * cell.log_resistance_std));
         ScalarGaussian { mean, variance }
     }
 }
@@ -408,7 +428,7 @@ pub fn of_pack(
     let drawn = discharge.unwrap_or(Load::usual(rated_ah));
     let charger = load.charger_a(mode);
     let charger_a = charger.unwrap_or(USUAL_LOAD_PER_H * rated_ah);
-    // A weaker charger ends as soon as the voltage is reached.
+    // If the charger delivers less than the taper current, the charge ends when the first cell reaches its highest voltage.
     let config = &OutlookConfig { taper_current_a: config.taper_current_a.min(charger_a), ..*config };
     let least = |value: &dyn Fn(&CellNow<'_>) -> f64| {
         cells.iter().map(|cell| (value(cell), cell)).min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, cell)| cell)
@@ -477,8 +497,8 @@ pub fn energy_health(config: &OutlookConfig, cell: &CellNow<'_>) -> ScalarGaussi
         let full = CellNow { soc: exact(1.0), ..*cell };
         full.delivered_wh(full.dischargeable_ah(&load, config), &load, config)
     };
-    let (model, cell) = (cell.model, &CellNow { temperature_c: CURVE_C, ..*cell });
-    let new = CellNow { capacity: exact(model.capacity_ah), log_resistance: exact(0.0), slow_ratio: 1.0, ..*cell };
+    let (model, cell) = (cell.model, &CellNow { temperature: cell.model.temperature_position(CURVE_C), ..*cell });
+    let new = CellNow { capacity: exact(model.capacity_ah), resistance_ratio: 1.0, slow_ratio: 1.0, ..*cell };
     let new_wh = energy_wh(&new) * model.rated_capacity_ah / model.capacity_ah;
     let aged = CellNow { soc: exact(1.0), ..*cell }.spread(energy_wh);
     ScalarGaussian { mean: aged.mean / new_wh, variance: aged.variance / square(new_wh) }

@@ -171,6 +171,7 @@ impl Stages {
     #[inline(never)]
     fn complete_batch(&mut self, now: Timestamp, out: &mut Outputs) {
         self.step_waiting(now, true, out);
+        self.estimation.current_check.forget_jumps();
         self.estimation.batch.begin();
         let all_fresh = self.sampling.sampler.voltages_fresh(now);
         let Self { estimation, learning, alarming, sending, .. } = self;
@@ -255,7 +256,11 @@ impl Stages {
         }
         let is_doubtful = |cell: usize| is_doubtful || estimation.is_voltage_frozen(cell);
         let doubtful: Vec<bool> = (0..estimation.cells()).map(is_doubtful).collect();
+        let first = publisher.out.events.len();
         learning.complete_mode(change, &mut estimation.bank, (is_label, &doubtful), &mut publisher);
+        if out.events[first..].iter().any(|event| matches!(event.kind, EventKind::HalfCycle { .. })) {
+            out.events.extend(self.recorded_outlook().map(|kind| Event { time: now, kind }));
+        }
     }
 
     /// Fits the cell model to the rows that the modelling stage has collected. If the fit changes the model, the

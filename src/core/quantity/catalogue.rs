@@ -286,14 +286,46 @@ impl<'de, const IS_PACK: bool> Deserialize<'de> for Values<IS_PACK> {
 /// Quantities recorded after each half-cycle of a cell: in the event `capacity`, in the history and in exported tables.
 pub const RECORDED: [Quantity; 3] = [Quantity::Capacity, Quantity::UsableCapacity, Quantity::ResistanceRatio];
 
-/// Values of the [`RECORDED`] quantities of a cell. `None` = unknown.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct RecordedValues([Option<Estimate>; RECORDED.len()]);
+/// Quantities recorded after each half-cycle of the pack: in the event `outlook`, in the history and in exported tables.
+pub const RECORDED_OF_PACK: [Quantity; 5] = [
+    Quantity::RemainingEnergy,
+    Quantity::EnergyToFull,
+    Quantity::EnergySoh,
+    Quantity::DischargePower10s,
+    Quantity::ChargePower10s,
+];
 
-impl RecordedValues {
-    /// The value of a quantity; `None` if it is unknown or not recorded.
+/// Values of some quantities. `None` = unknown.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Selection<const IS_PACK: bool, const N: usize>([Option<Estimate>; N]);
+
+/// Values of the [`RECORDED`] quantities of a cell.
+pub type RecordedValues = Selection<false, { RECORDED.len() }>;
+/// Values of the [`RECORDED_OF_PACK`] quantities.
+pub type RecordedPackValues = Selection<true, { RECORDED_OF_PACK.len() }>;
+
+impl<const IS_PACK: bool, const N: usize> Default for Selection<IS_PACK, N> {
+    fn default() -> Self {
+        Self([None; N])
+    }
+}
+
+impl<const IS_PACK: bool, const N: usize> Selection<IS_PACK, N> {
+    /// The selected quantities.
+    const fn quantities() -> &'static [Quantity] {
+        if IS_PACK { &RECORDED_OF_PACK } else { &RECORDED }
+    }
+
+    /// Selects from all values of an owner.
+    pub fn of(values: &Values<IS_PACK>) -> Self {
+        let mut selected = Self::default();
+        selected.0.iter_mut().zip(Self::quantities()).for_each(|(place, quantity)| *place = values.get(*quantity));
+        selected
+    }
+
+    /// The value of a quantity; `None` if it is unknown or not selected.
     pub fn get(&self, quantity: Quantity) -> Option<Estimate> {
-        RECORDED.iter().zip(self.0).find(|(recorded, _)| **recorded == quantity)?.1
+        Self::quantities().iter().zip(self.0).find(|(selected, _)| **selected == quantity)?.1
     }
 
     pub fn mean(&self, quantity: Quantity) -> Option<f64> {
@@ -304,11 +336,11 @@ impl RecordedValues {
         self.get(quantity).and_then(|estimate| Some((estimate.mean, estimate.std?)))
     }
 
-    /// Returns the values after replacing the value of `quantity`. Ignores quantities that are not recorded.
+    /// Returns the values after replacing the value of `quantity`. Ignores quantities that are not selected.
     #[must_use]
     pub fn with(mut self, quantity: Quantity, value: Option<impl Into<Estimate>>) -> Self {
         let value = value.map(Into::into).and_then(Estimate::known);
-        for (place, _) in self.0.iter_mut().zip(RECORDED).filter(|(_, recorded)| *recorded == quantity) {
+        for (place, _) in self.0.iter_mut().zip(Self::quantities()).filter(|(_, selected)| **selected == quantity) {
             *place = value;
         }
         self
@@ -316,20 +348,19 @@ impl RecordedValues {
 
     /// The keys of the values in order, each mean before its standard deviation.
     pub fn keys() -> impl Iterator<Item = &'static str> {
-        RECORDED.into_iter().flat_map(|quantity| quantity.row().parts().map(|(_, key)| key))
+        Self::quantities().iter().flat_map(|quantity| quantity.row().parts().map(|(_, key)| key))
     }
 }
 
-impl Serialize for RecordedValues {
+impl<const IS_PACK: bool, const N: usize> Serialize for Selection<IS_PACK, N> {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        write(serializer, RECORDED.into_iter().zip(self.0).map(|(quantity, value)| (quantity.row(), value)))
+        write(serializer, Self::quantities().iter().zip(self.0).map(|(quantity, value)| (quantity.row(), value)))
     }
 }
 
-impl<'de> Deserialize<'de> for RecordedValues {
+impl<'de, const IS_PACK: bool, const N: usize> Deserialize<'de> for Selection<IS_PACK, N> {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        let values = CellValues::deserialize(deserializer)?;
-        Ok(Self(RECORDED.map(|quantity| values.get(quantity))))
+        Values::deserialize(deserializer).map(|values| Self::of(&values))
     }
 }
 

@@ -96,6 +96,7 @@ impl EventLog {
             | EventKind::Capacity { .. }
             | EventKind::LossModes { .. }
             | EventKind::RemainingLife { .. }
+            | EventKind::Outlook { .. }
             | EventKind::RechargePeriod { .. } => {
                 log_learned(&event.kind);
             }
@@ -358,6 +359,17 @@ fn log_learned(kind: &EventKind) {
             let [cycles, cycles_low, cycles_high, days] = [cycles, cycles_low, cycles_high, days].map(known);
             tracing::info!(cell = cell.map(number), cycles, cycles_low, cycles_high, days, "remaining life");
         }
+        EventKind::Outlook { values } => {
+            let mean = |quantity| known(values.mean(quantity));
+            tracing::info!(
+                remaining_energy_wh = mean(Quantity::RemainingEnergy),
+                energy_to_full_wh = mean(Quantity::EnergyToFull),
+                energy_soh = mean(Quantity::EnergySoh),
+                discharge_power_10s_w = mean(Quantity::DischargePower10s),
+                charge_power_10s_w = mean(Quantity::ChargePower10s),
+                "energy and power"
+            );
+        }
         EventKind::RechargePeriod { seconds, normalised_s, normalised_std_s } => {
             let [seconds, normalised_s, normalised_std_s] = [seconds, normalised_s, normalised_std_s].map(known);
             tracing::info!(seconds, normalised_s, normalised_std_s, "recharge period");
@@ -373,7 +385,7 @@ mod tests {
     use crate::cell_faults::CellFaultKind;
     use crate::filter::ScalarGaussian;
     use crate::quantity::Mode;
-    use crate::quantity::catalogue::{RECORDED, RecordedValues};
+    use crate::quantity::catalogue::{RECORDED, RECORDED_OF_PACK, RecordedPackValues, RecordedValues};
 
     #[test]
     fn day_of_errors_gives_forty_complete_lines() {
@@ -457,6 +469,11 @@ mod tests {
                 days: known,
                 days_low: known,
                 days_high: known,
+            },
+            EventKind::Outlook {
+                values: RECORDED_OF_PACK
+                    .into_iter()
+                    .fold(RecordedPackValues::default(), |values, it| values.with(it, Some((x, x)))),
             },
             EventKind::Alarm {
                 rule: Rule::CapacityLow,

@@ -132,7 +132,7 @@ pub fn check_currents(current_a: &[f64], size: PackSize) -> Result<(), Implausib
 /// Checks voltages of a cell (V).
 ///
 /// # Errors
-/// The voltages are those of no cell.
+/// The voltages are impossible for a cell.
 pub fn check_voltages(cell_voltage_v: &[f64]) -> Result<(), Implausible> {
     if let Some(largest) = beyond(cell_voltage_v, MAX_CELL_V) {
         let probable = (1000.0..=1000.0 * MAX_CELL_V).contains(&largest).then_some("mV");
@@ -264,15 +264,15 @@ pub enum ShownSign {
     Unclear,
 }
 
-/// Finds the direction of positive current from the voltage's answers to steps. If the current has few steps, the
-/// stretches of constant current decide: their voltage rises or falls by 100 mV or more. In a load that varies, the
-/// voltage may recover although the cell discharges, so such stretches prove nothing.
+/// Finds the direction of positive current from the voltage's response to current steps. If the current has few steps,
+/// stretches of constant current also vote whose voltage changes by 100 mV or more. Stretches of a varying load do not
+/// vote, because the voltage may recover although the cell discharges.
 pub fn shown_sign(time_s: &[f64], current_a: &[f64], cell_voltage_v: &[f64]) -> ShownSign {
     let largest = current_a.iter().copied().filter(|i| i.is_finite()).fold(0.0_f64, |max, i| max.max(i.abs()));
     let is_never_negative = current_a.iter().all(|&i| i.is_nan() || i >= -0.01 * largest);
     let mut votes: Vec<bool> = steps(time_s, current_a, cell_voltage_v)
         .into_iter()
-        .filter(|(i, v)| i.abs() >= 0.1 * largest && v.abs() > 0.0005)
+        .filter(|(i, v)| *i != 0.0 && i.abs() >= 0.1 * largest && v.abs() > 0.0005)
         .map(|(i, v)| i * v < 0.0)
         .collect();
     if votes.len() < MIN_STEPS {

@@ -175,13 +175,13 @@ impl Readiness {
     fn state(&self) -> String {
         let count = self.interfaces.len();
         let mut line = match self.first_after {
-            None if !self.is_ready => "waiting for the first frame".to_owned(),
-            None => format!("running without input: no frame in {} s", self.timeout.as_secs_f64()),
+            None if !self.is_ready => "waiting for the first usable reading".to_owned(),
+            None => format!("running without input: no usable reading in {} s", self.timeout.as_secs_f64()),
             Some(_) if self.is_asleep => "running: buses asleep".to_owned(),
             Some(_) if !self.lost.is_empty() && self.lost.len() == self.inputs => "running without input".to_owned(),
             Some(after) => {
                 let plural = if count == 1 { "" } else { "s" };
-                format!("running: {count} interface{plural}, first frame after {:.1} s", after.as_secs_f64())
+                format!("running: {count} interface{plural}, first reading after {:.1} s", after.as_secs_f64())
             }
         };
         if let Some(restored) = &self.restored {

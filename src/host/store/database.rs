@@ -42,7 +42,7 @@ use crate::monitor::{EventKind, LearnedCell};
 use crate::quantity::Timestamp;
 
 /// The format that this program reads and writes.
-pub(super) const FORMAT: i32 = 2;
+pub(super) const FORMAT: i32 = 3;
 /// Longest wait of a commit for a reader that has locked the database.
 const BUSY_TIMEOUT: Duration = Duration::from_millis(100);
 /// Longest check of the file at the start. Damage in the part that was not checked is found when that part is read.

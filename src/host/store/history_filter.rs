@@ -17,7 +17,7 @@ use crate::token_bucket::{BucketSize, TokenBucket};
 /// Number of measured capacities of one cell that are written even if they have not changed: 64 at once (two days of an
 /// electric car), then one per hour. Further capacities are written only if they have changed, because each row takes
 /// 100 bytes and is kept for years. Without this limit, a hybrid that changes between charge and discharge every minute
-/// would write too many rows. Remaining lives have the same limit.
+/// would write too many rows. Remaining lives, and energy and power, have the same limit.
 const CAPACITIES: BucketSize = BucketSize { burst: 64.0, period_s: 3600.0 };
 /// Smallest change of a capacity or remaining life that is written even if the allowance is used up, in standard
 /// deviations.
@@ -54,6 +54,7 @@ pub(super) struct HistoryCommit {
 pub(super) struct HistoryFilter {
     written: BTreeMap<CellIndex, WrittenCapacity>,
     written_life: WrittenLife,
+    outlooks: TokenBucket,
     carried: TokenBucket,
     deferred: Vec<HistoryRow>,
 }
@@ -63,6 +64,7 @@ impl Default for HistoryFilter {
         Self {
             written: BTreeMap::new(),
             written_life: WrittenLife { cycles: None, token_bucket: TokenBucket::new(CAPACITIES) },
+            outlooks: TokenBucket::new(CAPACITIES),
             carried: TokenBucket::new(CARRIED),
             deferred: Vec::new(),
         }
@@ -148,6 +150,9 @@ impl HistoryFilter {
                 now,
             );
         }
+        if matches!(kind, EventKind::Outlook { .. }) {
+            return self.outlooks.take(now);
+        }
         let EventKind::Capacity { cell, measured_ah, values, .. } = *kind else {
             return !matches!(kind, EventKind::RechargePeriod { .. });
         };
@@ -195,6 +200,7 @@ impl Urgency {
             | EventKind::Capacity { .. }
             | EventKind::LossModes { .. }
             | EventKind::RemainingLife { .. }
+            | EventKind::Outlook { .. }
             | EventKind::RechargePeriod { .. }
             | EventKind::Model { .. }
             | EventKind::PackReplaced { .. }
@@ -215,6 +221,7 @@ mod tests {
     use super::super::rows::tests::{alarm, capacity, half_cycle, loss_modes, model, remaining_life};
     use super::*;
     use crate::monitor::Source;
+    use crate::quantity::catalogue::RecordedPackValues;
 
     /// Number of rows that are committed at once.
     fn take(history_filter: &mut HistoryFilter, seconds: f64, kinds: &[EventKind]) -> Option<usize> {
@@ -297,6 +304,18 @@ mod tests {
             "the remaining life is no longer known"
         );
         assert_eq!(take(&mut history_filter, 86_343.0, &[half_cycle(0), unknown]), Some(1));
+    }
+
+    #[test]
+    fn energy_and_power_are_written_once_an_hour_at_most_after_burst() {
+        let mut history_filter = HistoryFilter::default();
+        let outlook = EventKind::Outlook { values: RecordedPackValues::default() };
+        let rows = (0..1440).map(|minute| {
+            let time = Timestamp::from_secs(60.0 * f64::from(minute));
+            let events = [half_cycle(0), outlook].map(|kind| Event { time, kind });
+            history_filter.take(&events).map_or(0, |commit| commit.rows.len() - 1)
+        });
+        assert_eq!(rows.sum::<usize>(), 64 + 23);
     }
 
     #[test]

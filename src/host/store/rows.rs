@@ -9,7 +9,7 @@ use rusqlite::types::Value;
 
 use super::stamp::Stamp;
 use crate::monitor::EventKind;
-use crate::quantity::catalogue::RecordedValues;
+use crate::quantity::catalogue::{RecordedPackValues, RecordedValues};
 
 /// Value of `change` for an alarm that ended because no threshold monitors it any longer.
 pub(super) const DROPPED: &str = "dropped";
@@ -48,6 +48,8 @@ pub enum HistoryTable {
     LossModes,
     /// Forecasts of the remaining life. Each forecast is for the cell that reaches its end of life first.
     RemainingLife,
+    /// Energy and power of the pack after its charges and discharges.
+    Outlook,
     /// Changes of the cell model that the daemon learns.
     Model,
     /// Changes of alarms.
@@ -58,8 +60,16 @@ pub enum HistoryTable {
 
 impl HistoryTable {
     /// All tables, in display order.
-    pub const ALL: [Self; 7] =
-        [Self::HalfCycle, Self::Capacity, Self::LossModes, Self::RemainingLife, Self::Model, Self::Alarm, Self::Reset];
+    pub const ALL: [Self; 8] = [
+        Self::HalfCycle,
+        Self::Capacity,
+        Self::LossModes,
+        Self::RemainingLife,
+        Self::Outlook,
+        Self::Model,
+        Self::Alarm,
+        Self::Reset,
+    ];
 
     /// SQL type of a column.
     pub(super) fn sql_type(column: &str) -> &'static str {
@@ -77,6 +87,7 @@ impl HistoryTable {
             Self::Capacity => "capacity",
             Self::LossModes => "loss_modes",
             Self::RemainingLife => "remaining_life",
+            Self::Outlook => "outlook",
             Self::Model => "model",
             Self::Alarm => "alarm",
             Self::Reset => "reset",
@@ -88,6 +99,9 @@ impl HistoryTable {
         static CAPACITY: LazyLock<Vec<&str>> = LazyLock::new(|| {
             ["cell", "measured_ah", "measured_std_ah"].into_iter().chain(RecordedValues::keys()).collect()
         });
+        // The pack has no number. As in the other tables, the first column contains the cell, here always NULL.
+        static OUTLOOK: LazyLock<Vec<&str>> =
+            LazyLock::new(|| ["cell"].into_iter().chain(RecordedPackValues::keys()).collect());
         match self {
             Self::HalfCycle => &[
                 "cell",
@@ -102,6 +116,7 @@ impl HistoryTable {
             Self::Capacity => &CAPACITY,
             Self::LossModes => &["cell", "lli", "lli_std", "lam_ne", "lam_ne_std", "lam_pe", "lam_pe_std"],
             Self::RemainingLife => &["cell", "cycles", "cycles_low", "cycles_high", "days", "days_low", "days_high"],
+            Self::Outlook => &OUTLOOK,
             Self::Model => {
                 &["cell", "state", "capacity_ah", "capacity_std_ah", "residual_v", "chemistry", "taken_back"]
             }
@@ -148,6 +163,7 @@ impl HistoryRow {
             EventKind::Capacity { .. } => (HistoryTable::Capacity, vec![]),
             EventKind::LossModes { .. } => (HistoryTable::LossModes, vec![]),
             EventKind::RemainingLife { .. } => (HistoryTable::RemainingLife, vec![]),
+            EventKind::Outlook { .. } => (HistoryTable::Outlook, vec![]),
             EventKind::Model { is_taken_back, .. } => {
                 (HistoryTable::Model, vec![("taken_back", Value::Integer(i64::from(*is_taken_back)))])
             }
@@ -175,7 +191,7 @@ impl HistoryRow {
 
     /// Whether the row is a detail, which is dropped first when the backlog is full.
     pub(super) const fn is_detail(&self) -> bool {
-        matches!(self, Self::Event(EventKind::HalfCycle { .. }))
+        matches!(self, Self::Event(EventKind::HalfCycle { .. } | EventKind::Outlook { .. }))
     }
 
     /// The identity of the connected pack, if this row contains it.

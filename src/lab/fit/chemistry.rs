@@ -9,7 +9,7 @@ use crate::cell::own_model::fit;
 use crate::cell::{CellModel, CellStep, Chemistry, Label, Notebook, NotebookConfig};
 use crate::ident::MeasuredPart;
 
-/// Difference of the log posterior densities above which another chemistry is reported; the daemon uses the same value.
+/// Difference of the log posterior densities above which another chemistry is reported.
 const MARGIN: f64 = 12.0;
 
 /// Returns the label from which a model was derived; `None` = the model comes from a file.

@@ -1,6 +1,6 @@
-//! Exports the results of logs as tables of estimates, half-cycles and alarms, in Parquet or CSV format.
+//! Exports the results of logs as tables of estimates, half-cycles, energies and alarms, in Parquet or CSV format.
 //!
-//! Input: a configuration and logs. Output: for each log, a folder `NAME/` with `estimates`, `half_cycles`, `alarms` and
+//! Input: a configuration and logs. Output: for each log, a folder `NAME/` with `estimates`, `half_cycles`, `outlook`, `alarms` and
 //! `use_record` (`.parquet` or `.csv`; see [`columns`] for columns and units), and with `about.json`. `about.json` is written last:
 //! if it exists, the tables are complete. A file gets its final name only when it is complete. Memory holds one row
 //! group per table and log, no matter how long the log is. If a log cannot be replayed, its folder gets no new file,
@@ -18,7 +18,7 @@ use std::sync::Arc;
 use serde::Serialize;
 use serde_json::json;
 
-use self::rows::{AlarmRow, EstimateRow, HalfCycleRow, UseRow};
+use self::rows::{AlarmRow, EstimateRow, HalfCycleRow, OutlookRow, UseRow};
 use self::table::TableFile;
 use super::drive::{DriveSummary, LogAccess, drive};
 use super::vehicle::LearnedModel;
@@ -244,6 +244,7 @@ struct LogTables {
     log: Arc<str>,
     estimates: Option<TableFile<EstimateRow>>,
     half_cycles: TableFile<HalfCycleRow>,
+    outlooks: TableFile<OutlookRow>,
     alarms: TableFile<AlarmRow>,
     uses: TableFile<UseRow>,
     period_ns: i64,
@@ -268,6 +269,7 @@ impl LogTables {
                 .map(|_| TableFile::create(&path("estimates"), form, columns::ESTIMATES))
                 .transpose()?,
             half_cycles: TableFile::create(&path("half_cycles"), form, &columns::HALF_CYCLES)?,
+            outlooks: TableFile::create(&path("outlook"), form, &columns::OUTLOOK)?,
             alarms: TableFile::create(&path("alarms"), form, columns::ALARMS)?,
             uses: TableFile::create(&path("use_record"), form, columns::USE_RECORD)?,
             period_ns: (settings.period_s.unwrap_or(0.0) * 1e9) as i64,
@@ -315,6 +317,7 @@ impl LogTables {
                 let row = HalfCycleRow { log, time, since_s, full_cycles, half, capacity, losses, remaining };
                 self.half_cycles.push(&row)?;
             }
+            EventKind::Outlook { values } => self.outlooks.push(&OutlookRow { log, time, since_s, values })?,
             EventKind::PackReplaced { .. } => self.moved_ah.fill(0.0),
             EventKind::Alarm { rule, .. } => {
                 self.alarms.push(&AlarmRow { log, time, since_s, rule, alarm: Fields::of_event(&event.kind) })?;
@@ -343,6 +346,7 @@ impl LogTables {
         UseRow::of_record(&self.log, record)?.iter().try_for_each(|row| self.uses.push(row))?;
         let mut rows = BTreeMap::from([
             ("half_cycles", self.half_cycles.finish(metadata)?),
+            ("outlook", self.outlooks.finish(metadata)?),
             ("alarms", self.alarms.finish(metadata)?),
             ("use_record", self.uses.finish(metadata)?),
         ]);

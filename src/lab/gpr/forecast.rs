@@ -315,7 +315,7 @@ pub fn write(path: &Path, data: &ColumnTable, forecast: &TableForecast) -> Resul
     write_csv(path, heads.map(str::to_owned).to_vec(), rows)
 }
 
-/// Divides the rows into equal stretches and returns one row of each, at most `most` rows. The position of this row
+/// Divides the rows into equal stretches and returns a row of each, at most `most` different rows. The position of this row
 /// differs between stretches. If rows repeat, for example in cycles, a fixed position would always select rows of the
 /// same phase.
 fn chosen(all: &[usize], most: usize) -> Vec<usize> {
@@ -323,7 +323,10 @@ fn chosen(all: &[usize], most: usize) -> Vec<usize> {
     // The fractional parts of multiples of the golden ratio fill a stretch evenly and never repeat.
     let place = |k: usize| if count == all.len() { 0.0 } else { (k as f64 * 0.618_033_988_749_894_9).fract() };
     let at = |k: usize| ((k as f64 + place(k)) * all.len() as f64 / count as f64) as usize;
-    (0..count).map(|k| all[at(k).min(all.len() - 1)]).collect()
+    let mut rows: Vec<usize> = (0..count).map(|k| all[at(k).min(all.len() - 1)]).collect();
+    // Neighbouring positions can fall on one row if a stretch has fewer than two rows.
+    rows.dedup();
+    rows
 }
 
 #[cfg(test)]

@@ -186,8 +186,8 @@ impl Data {
                 let colon = if detail.is_empty() { "" } else { ": " };
                 self.incidents.push((time_s, format!("{reason}{of}{colon}{detail}")));
             }
-            // The forecast is computed again for the report.
-            HistoryTable::RemainingLife => {}
+            // The forecast is computed again for the report. The report shows the latest energy from the status.
+            HistoryTable::RemainingLife | HistoryTable::Outlook => {}
         }
     }
 

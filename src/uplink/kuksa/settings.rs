@@ -88,14 +88,17 @@ impl KuksaSettings {
             return Ok(());
         }
         Err(format!(
-            "kuksa.branch = \"{branch}\", must be a branch below Vehicle without other signals, at most {MAX_BRANCH_BYTES} bytes, each \
-            part a capital letter, then letters and digits"
+            "kuksa.branch = \"{branch}\", must be a branch below Vehicle other than {STANDARD_BRANCH}, with at most {MAX_BRANCH_BYTES} \
+            bytes; each part must begin with a capital letter and contain only letters and digits"
         ))
     }
 }
 
 /// Whether the host of `HOST:PORT` is this computer.
 fn is_loopback(authority: &str) -> bool {
+    if authority.contains('@') {
+        return false; // the host follows a user's name
+    }
     let host = authority.rsplit_once(':').map_or(authority, |(host, _)| host);
     let address: Result<IpAddr, _> = host.trim_start_matches('[').trim_end_matches(']').parse();
     host == "localhost" || address.is_ok_and(|address| address.is_loopback())
@@ -137,6 +140,10 @@ mod tests {
             ("server_name = 'x'", "kuksa.server_name is allowed with https:// only"),
             (
                 "address = 'http://10.0.0.1:1'\ntoken_file = '/t'",
+                "kuksa.token_file: without TLS the token could be read on the network",
+            ),
+            (
+                "address = 'http://127.0.0.1:80@evil:1'\ntoken_file = '/t'",
                 "kuksa.token_file: without TLS the token could be read on the network",
             ),
             ("branch = 'Vehicle.Powertrain.TractionBattery'", "kuksa.branch"),

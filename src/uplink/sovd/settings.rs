@@ -8,7 +8,7 @@ use serde::{Deserialize, Deserializer, de::Error as _};
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SovdSettings {
-    /// Address and port: only of this computer, because the server has no access control.
+    /// Address and port. The address must be a loopback address, because the server has no access control.
     #[serde(deserialize_with = "loopback")]
     pub listen: SocketAddr,
 }

@@ -14,14 +14,14 @@ energy     remaining 541.0 ± 23.0 Wh, to full -, 1 h 12 min ± 10 min 0 s to em
 power      for 10 s: discharge 8.2 ± 0.4 kW (cell 1), charge - (cell 1)
 health     capacity 2.412 ± 0.021 Ah (cell 1), SOH 92.8 %, usable 2.310 ± 0.040 Ah, recharge period -, with the \
 reference charger 5432 ± 61 s
-offset     current sensor -0.034 ± 0.011 A (reading less true current)
+offset     current sensor -0.034 ± 0.011 A (reading minus true current)
 model      learning
 losses     lithium 6.1 ± 1.2 %, negative electrode 2.2 ± 2.3 %, positive electrode 2.1 ± 2.4 %
 life       412 equivalent full cycles (90 %: 208 to 933) (cell 1), 533 days at the recent use
 use        events beyond limits -, fast charges 12, at rest above 80 % -
 interface  can0 up: 86400 frames in, 6 lost, 1200 out, 17 not sent, 4 errors, 1 bus-off, 1 reconnects
 interface  can1 missing: 86400 frames in, 6 lost, 1200 out, 17 not sent, 4 errors, 1 bus-off, 1 reconnects
-counted    123456 readings used, 7 rejected; 3 late ticks; 99 % of estimates within 5.00 ms
+counted    123456 readings used, 7 rejected; 3 late ticks; 99 % of frames processed within 5.00 ms
 store      works, 21 commits, 0.1 MB
 commands   can0 6B3: unauthenticated
 requests   silent: another tester is active; 1 rejected permanently
@@ -86,10 +86,10 @@ fn failing_store_and_late_estimates_are_shown() {
         ),
         "{text}"
     );
-    assert!(text.contains("99 % of estimates within more than 1 s\n"), "{text}");
+    assert!(text.contains("99 % of frames processed within more than 1 s\n"), "{text}");
     (document.store, document.latency) = (None, Default::default());
     let text = table(&document, false);
-    assert!(text.contains("store      none\n") && text.contains("99 % of estimates within -\n"), "{text}");
+    assert!(text.contains("store      none\n") && text.contains("99 % of frames processed within -\n"), "{text}");
 }
 
 #[test]

@@ -52,6 +52,14 @@ fn authenticator_covers_data_id_data_and_freshness() {
     assert_eq!(input.bytes(), [0x01, 0x24, 1, 2, 3, 4, 1, 2, 3, 4, 5, 6, 7, 8]);
     assert_eq!(COMMAND.mac_input(&[0; 3], 0), None, "shorter than the trailer");
     assert_eq!(COMMAND.mac_input(&[0; 69], 0), None, "more data than a frame can carry");
+    assert_eq!(COMMAND.mac_input(&[0; 68], 0).unwrap().bytes().len(), 2 + 64 + 8, "the longest input");
+}
+
+#[test]
+fn profiles_serialise_with_configuration_names() {
+    for profile in Profile::ALL {
+        assert_eq!(serde_json::to_string(&profile).unwrap(), format!("\"{}\"", profile.name()));
+    }
 }
 
 #[test]
@@ -94,6 +102,16 @@ fn restart_begins_beyond_all_announced_values() {
         };
         assert!((last - 64..last + 16).all(|value| is_old(value).is_none()), "{stored_s} {now_s}");
     }
+}
+
+#[test]
+fn start_begins_at_clock_unless_stored_value_is_higher() {
+    let by_clock = 1_700_000_000 * ANNOUNCEMENT_STEP;
+    let mut window = FreshnessWindow::default();
+    window.begin(Timestamp::from_secs(1.7e9));
+    assert_eq!(window.announced(), by_clock);
+    window.begin(Timestamp::from_secs(1.6e9));
+    assert_eq!(window.announced(), by_clock + 4096 * ANNOUNCEMENT_STEP, "the clock was set back");
 }
 
 #[test]

@@ -22,10 +22,11 @@ fn cell(model: &CellModel, soc: f64) -> CellNow<'_> {
         model,
         soc: exact(soc),
         capacity: exact(2.0),
-        log_resistance: exact(0.0),
+        resistance_ratio: 1.0,
+        log_resistance_std: 0.0,
         slow_ratio: 1.0,
         branch_v: [0.0; MAX_BRANCHES],
-        temperature_c: 0.0,
+        temperature: model.temperature_position(0.0),
     }
 }
 
@@ -147,7 +148,7 @@ fn power_reaches_limit_of_voltage_or_current() {
 fn weakest_and_fullest_cell_limit_pack() {
     let model = small_model();
     let mut cells = [cell(&model, 0.5); 4];
-    (cells[1].soc.mean, cells[2].soc.mean, cells[3].log_resistance.mean) = (0.2, 0.9, 0.5);
+    (cells[1].soc.mean, cells[2].soc.mean, cells[3].resistance_ratio) = (0.2, 0.9, 0.5_f64.exp());
     let pack = Structure { series_per_state: 1.0, strings: 2.0, soc: 0.5, capacity_ah: 0.6 };
     let charge = loaded(Mode::Charge, -0.5);
     let outlook = of_pack(&CONFIG, (&charge, Mode::Charge), &cells, &pack).unwrap();
@@ -157,7 +158,7 @@ fn weakest_and_fullest_cell_limit_pack() {
     // 0.4 Ah from four cells at about 3.0 + 1.2 SOC in two strings, at C/2.
     near(outlook.remaining_wh.mean, 2.0 * 0.4 * (3.48 + 3.12 + 3.96 + 3.48 - 4.0 * 0.1), 0.03);
     // A cell with a high resistance is empty first, although it contains more charge.
-    cells[3].log_resistance.mean = 3.0;
+    cells[3].resistance_ratio = 3.0_f64.exp();
     let weak = of_pack(&CONFIG, (&charge, Mode::Charge), &cells, &pack).unwrap();
     assert!(weak.remaining_wh.mean < 0.7 * outlook.remaining_wh.mean, "{weak:?}");
     // The target of the pack is unreachable: the fullest cell is full before.
@@ -183,7 +184,7 @@ fn each_error_widens_what_depends_on_it() {
     let more = |widened: &Outlook| (widened.remaining_wh.variance - known.remaining_wh.variance).sqrt();
     near(more(&of(|cell| cell.soc.variance = square(0.02))), 0.02 * 2.0 * (3.0 + 1.2 * 0.6), 0.05);
     near(more(&of(|cell| cell.capacity.variance = square(0.1))), 0.05 * known.remaining_wh.mean, 0.05);
-    let by_resistance = of(|cell| cell.log_resistance.variance = square(0.1));
+    let by_resistance = of(|cell| cell.log_resistance_std = 0.1);
     near(by_resistance.discharge_w[1].std(), 0.1 * known.discharge_w[1].mean, 0.15);
     // At the end of the scale, the error lies on one side.
     let empty = of(|cell| (cell.soc.mean, cell.soc.variance) = (0.0, square(0.02)));
@@ -243,8 +244,8 @@ fn recent_load_contains_changing_current_without_mode() {
 fn energy_health_counts_lost_capacity_and_resistance_at_any_temperature() {
     let model = small_model();
     let health = |capacity_ah: f64, log_ratio: f64, temperature_c: f64| {
-        let mut cell = CellNow { temperature_c, ..cell(&model, 0.5) };
-        (cell.capacity.mean, cell.log_resistance.mean) = (capacity_ah, log_ratio);
+        let mut cell = CellNow { temperature: model.temperature_position(temperature_c), ..cell(&model, 0.5) };
+        (cell.capacity.mean, cell.resistance_ratio) = (capacity_ah, log_ratio.exp());
         energy_health(&CONFIG, &cell).mean
     };
     near(health(2.0, 0.0, 0.0), 1.0, 1e-9);
@@ -259,7 +260,7 @@ fn outlook_at_limits_of_state_is_finite() {
     for soc in [0.0, 1e-9, 0.5, 1.0] {
         for log_ratio in [-20.0, 0.0, 8.0] {
             let mut state = cell(&model, soc);
-            (state.log_resistance.mean, state.soc.variance) = (log_ratio, 0.1);
+            (state.resistance_ratio, state.soc.variance) = (f64::exp(log_ratio), 0.1);
             for mode in [(Mode::Charge, -1.0), (Mode::Discharge, 1.0), (Mode::Rest, 0.0)] {
                 let outlook = of_one(state, mode);
                 let times = [outlook.to_empty_s, outlook.to_full_s, outlook.to_target_s].into_iter().flatten();

@@ -77,7 +77,7 @@ fn time_beyond_each_limit_is_counted_with_extremes() {
 }
 
 #[test]
-fn event_lasts_a_second_and_ends_after_ten() {
+fn event_needs_1_s_beyond_and_ends_after_10_s_within() {
     let mut bench = Bench::new();
     let hot = UseSample { temperature_c: range(50.0, 50.0, true), ..REST };
     let mut events = |seconds: u32, sample: &UseSample| bench.run(seconds, sample).temperature_c.above.events;
@@ -165,7 +165,7 @@ fn rest_at_high_soc_includes_gaps_only_if_parked() {
 }
 
 #[test]
-fn gaps_and_unknown_downtimes_are_not_use() {
+fn gaps_do_not_count_as_time_beyond_limits() {
     let hot = UseSample { temperature_c: range(50.0, 50.0, true), soc: Some(0.95), ..REST };
     let mut bench = Bench::new();
     bench.run(10, &hot);

@@ -17,7 +17,7 @@ use crate::can::rate::SenderChange;
 use crate::can::uds::MessageLoss;
 use crate::cell::Chemistry;
 use crate::cell_faults::CellFault;
-use crate::quantity::catalogue::RecordedValues;
+use crate::quantity::catalogue::{RecordedPackValues, RecordedValues};
 use crate::quantity::{BusIndex, CellIndex, Fault, Mode, Timestamp};
 
 /// Kind of an event, with its data.
@@ -99,6 +99,12 @@ pub enum EventKind {
         days_low: Option<f64>,
         /// 95 % quantile of `days`.
         days_high: Option<f64>,
+    },
+    /// Energy and power of the pack after a half-cycle. Not sent while they are unknown.
+    Outlook {
+        /// The values at the end of the half-cycle.
+        #[serde(flatten)]
+        values: RecordedPackValues,
     },
     /// A charge that covered the recharge window, or enough of it, has ended.
     RechargePeriod {

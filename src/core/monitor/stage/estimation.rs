@@ -157,6 +157,7 @@ impl Estimation {
         self.progress.fill(CellProgress::default());
         self.trusted.fill(true);
         self.all_trusted = true;
+        self.current_check.interrupt();
         self.begin_checks();
     }
 
@@ -165,7 +166,7 @@ impl Estimation {
         self.note_checks();
     }
 
-    /// Whether the current is doubtful, or a jump of the SOC waits for a step of the current that is explained.
+    /// Whether the current is doubtful, or the SOC has jumped and no explained step of the current has confirmed it since.
     pub(crate) fn is_doubtful(&self) -> bool {
         self.is_current_doubtful || self.current_check.is_unconfirmed()
     }
@@ -210,9 +211,7 @@ impl Estimation {
         let rest_a = self.bank.own_config().gap.rest_current_a;
         let is_rest = |sample: &CellSample| sample.current_a.is_some_and(|a| a != 0.0 && a.abs() <= rest_a);
         let has_jumped = |sample: &&CellSample| self.bank.result(sample.cell.index()).jumped && !is_rest(sample);
-        if 2 * samples.iter().filter(has_jumped).count() > samples.len() {
-            self.current_check.demand_step();
-        }
+        self.current_check.note_jumps(samples.iter().filter(has_jumped).count(), self.progress.len());
         self.check_models(&samples);
         if modelling.has_row() {
             modelling.close_row(self.mean_soc());
@@ -224,8 +223,12 @@ impl Estimation {
     fn check_current(&mut self, samples: &[CellSample]) {
         let Self { bank, current_check, .. } = self;
         let own = bank.own_cells();
-        let place = |sample: &CellSample| own.iter().take(MAX_CELLS).position(|&cell| cell == sample.cell.index());
-        let compared = samples.iter().take(MAX_CELLS).filter_map(|sample| Some((place(sample)?, sample)));
+        let own_compared = &own[..own.len().min(MAX_CELLS)];
+        // The cells are in ascending order.
+        let last = own_compared[own_compared.len() - 1];
+        let is_near = |sample: &&CellSample| sample.cell.index() <= last;
+        let place = |sample: &CellSample| own_compared.iter().position(|&cell| cell == sample.cell.index());
+        let compared = samples.iter().filter(is_near).filter_map(|sample| Some((place(sample)?, sample)));
         let soc = bank.filtered_soc(own[0]).map_or(0.5, |soc| soc.mean.clamp(0.0, 1.0));
         let temperature_c = bank.temperature_c(own[0]).unwrap_or(self.ambient_c);
         let ohm = bank.own_model().r0_ohm(&bank.own_model().grid_position(soc, temperature_c));
@@ -419,7 +422,7 @@ impl Estimation {
         check.is_of_other(model_id(self.bank.model(index), self.bank.config(index).initial.log_resistance_std))
     }
 
-    /// Mean over the pack's own kind of cells of the SOC and of its variance; `None` if no such cell has an estimate.
+    /// Mean SOC and mean SOC variance of the pack's own kind of cells; `None` if no such cell has an estimate.
     pub(crate) fn mean_estimate(&self) -> Option<ScalarGaussian> {
         let socs = self.bank.own_cells().iter().filter_map(|&cell| self.bank.filtered_soc(cell));
         let (count, mean, variance) = socs.fold((0.0, 0.0, 0.0), |(count, mean, variance), soc| {
@@ -460,6 +463,7 @@ impl Estimation {
 
     /// Handles a gap of unknown length. Charge is not counted across the gap.
     pub(crate) fn handle_unknown_gap(&mut self) {
+        self.current_check.interrupt();
         self.bank.change_all(|_, cell| cell.handle_unknown_gap());
         self.progress.iter_mut().for_each(|cell| cell.consumed = None);
     }

@@ -1,12 +1,12 @@
 //! Energy, time and power of the pack and its cells, from the states of the stages. They are computed on demand, for a
 //! view.
 
-use super::Stages;
+use super::{EventKind, Stages};
 use crate::cell::{ModelBands, arrhenius};
 use crate::filter::{ScalarGaussian, square};
 use crate::health::outlook::{CellNow, Outlook, Structure, energy_health, of_pack};
 use crate::quantity::CellIndex;
-use crate::quantity::catalogue::{PackValues, Quantity};
+use crate::quantity::catalogue::{PackValues, Quantity, RecordedPackValues};
 use crate::sample::VoltageSource;
 
 impl Stages {
@@ -46,6 +46,14 @@ impl Stages {
         outlook.map(|it| it.limiting_cells)
     }
 
+    /// The event with the pack's energy and power; `None` while they are unknown.
+    pub(super) fn recorded_outlook(&self) -> Option<EventKind> {
+        let mut values = PackValues::default();
+        self.set_outlook(&mut values)?;
+        values.set(Quantity::EnergySoh, self.energy_soh());
+        Some(EventKind::Outlook { values: RecordedPackValues::of(&values) })
+    }
+
     /// State of health by energy of the cell with the least capacity; `None` until every capacity has been learned.
     pub(crate) fn energy_soh(&self) -> Option<ScalarGaussian> {
         let (index, _) = self.learning.weakest()?;
@@ -67,10 +75,11 @@ impl Stages {
             model: bank.model(index),
             soc,
             capacity: self.learning.capacity(index),
-            log_resistance: ScalarGaussian { variance: of_cell.variance + square(local) + square(outside), ..of_cell },
+            resistance_ratio: libm::exp(of_cell.mean),
+            log_resistance_std: (of_cell.variance + square(local) + square(outside)).sqrt(),
             slow_ratio: estimator.slow_ratio(bank.config(index)).mean,
             branch_v: estimator.branch_v(),
-            temperature_c,
+            temperature: bank.model(index).temperature_position(temperature_c),
         })
     }
 }

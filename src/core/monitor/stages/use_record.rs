@@ -1,4 +1,4 @@
-//! Passes the pack's values to the record of use, every 0.1 s while the inputs are judged.
+//! Passes the pack's values to the record of use, every 0.1 s while the bus is not silent.
 //!
 //! The current, and the SOC with it, is unknown while it is doubtful. While an input message has a second sender, all
 //! values are unknown. Limits come from `[outlook]`; without a limit of the voltage, from the cell models. If modules

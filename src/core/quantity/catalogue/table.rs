@@ -54,7 +54,7 @@ pub static TABLE: [QuantityRow; 38] = [
             Overlay("Capacity.Learned"),
         )
         .cell(
-            "Learned capacity between the open-circuit voltages full and empty",
+            "Learned capacity between the open-circuit voltages of a full and an empty cell",
             Some("cell_capacity"),
             Overlay("Cells.Capacity"),
         ),
@@ -65,7 +65,7 @@ pub static TABLE: [QuantityRow; 38] = [
         "usable_capacity",
     )
     .pack(
-        "Least charge that can be drawn from a full cell at the configured load",
+        "Usable capacity of the cell that has the least: charge from full to empty at the configured load",
         ("usable_capacity", "Usable Capacity"),
         Overlay("Capacity.Usable"),
     )
@@ -75,7 +75,7 @@ pub static TABLE: [QuantityRow; 38] = [
         Overlay("Cells.UsableCapacity"),
     ),
     Row::estimate(Q::Soh, ("soh", "soh_std"), Unit::Level, "soh").pack(
-        "Least learned capacity of a cell over the rated capacity; may exceed 1",
+        "Lowest learned capacity of a cell, divided by the rated capacity; may exceed 1",
         ("state_of_health", "State of Health"),
         Overlay("StateOfHealth.Learned"),
     ),
@@ -98,21 +98,21 @@ pub static TABLE: [QuantityRow; 38] = [
         .cell("Loss of lithium inventory, relative to a new cell", None, Overlay("Cells.LithiumInventoryLoss")),
     Row::estimate(Q::NegativeLoss, ("lam_ne", "lam_ne_std"), Unit::Fraction, "lam_ne")
         .pack(
-            "Loss of active material of the negative electrode of that cell",
+            "Loss of active material of the negative electrode of the cell with the least capacity",
             ("negative_loss", "Loss of Negative Electrode"),
             Overlay("Loss.NegativeElectrode"),
         )
         .cell("Loss of active material of the negative electrode", None, Overlay("Cells.NegativeElectrodeLoss")),
     Row::estimate(Q::PositiveLoss, ("lam_pe", "lam_pe_std"), Unit::Fraction, "lam_pe")
         .pack(
-            "Loss of active material of the positive electrode of that cell",
+            "Loss of active material of the positive electrode of the cell with the least capacity",
             ("positive_loss", "Loss of Positive Electrode"),
             Overlay("Loss.PositiveElectrode"),
         )
         .cell("Loss of active material of the positive electrode", None, Overlay("Cells.PositiveElectrodeLoss")),
     Row::number(Q::RemainingCycles, "remaining_cycles", Unit::Cycles, "remaining_cycles")
         .pack(
-            "Equivalent full cycles until the first end of life of a cell, median",
+            "Equivalent full cycles until the first cell reaches its end of life, median",
             ("remaining_cycles", "Remaining Cycles"),
             Overlay("RemainingLife.Cycles"),
         )
@@ -133,7 +133,7 @@ pub static TABLE: [QuantityRow; 38] = [
         .cell("95 % quantile of the remaining cycles", None, Overlay("Cells.RemainingCyclesHigh")),
     Row::number(Q::RemainingDays, "remaining_days", Unit::Days, "remaining_life")
         .pack(
-            "Time until the first end of life of a cell at the recent use, median",
+            "Time until the first cell reaches its end of life at the recent use, median",
             ("remaining_days", "Remaining Days"),
             Overlay("RemainingLife.Time"),
         )

@@ -82,7 +82,7 @@ fn any_change_of_a_byte_causes_no_panic() {
 }
 
 #[test]
-fn overlong_line_costs_only_itself() {
+fn overlong_line_is_skipped_and_reported() {
     let line = format!("0.5 1  100 Rx d 1 05 // {}\n", "x".repeat(300_000));
     let log = format!("base hex timestamps absolute\n0.1 1 100 Rx d 1 01\n{line}0.9 1 100 Rx d 1 09\n");
     assert_eq!(content(log.as_bytes()), ["0.1 0 100 01", "longer than 256 KiB", "0.9 0 100 09"]);

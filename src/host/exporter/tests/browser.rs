@@ -177,7 +177,9 @@ fn page_shows_what_the_document_says() {
     let _daemon = FakeDaemon::start(&socket, back);
     browser.wait_for_headline(HEALTHY);
     assert_eq!(browser.texts("#now b")[0], "50.0 %");
-    let report = browser.close();
+    let mut report = browser.close();
+    // On a busy machine, the page may lose the stream and ask for it again.
+    report["requests"].as_array_mut().unwrap().dedup();
     assert_eq!(report, json!({ "requests": [format!("{url}events")], "messages": [], "overflow_px": 0 }));
 }
 

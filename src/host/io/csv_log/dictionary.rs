@@ -1,7 +1,7 @@
 //! The names of columns in the exports of cyclers, applications and battery management systems.
 //!
 //! In: the names of a header. Out: the [`Role`] of each known column, and the [`Format`] that writes such a header.
-//! Sources: the exports' own headers, as their readers in public projects name them.
+//! Source: the column names in public projects that read these exports.
 
 use super::column_name::ColumnName;
 use crate::io::units::{Quantity, Unit};

@@ -65,14 +65,17 @@ fn leaked(id: u16, data: &[u8]) -> &'static Frame {
 #[test]
 fn service_is_ready_with_first_usable_reading() {
     let mut scene = Scene::new(None);
-    assert_eq!(scene.tick(0.0), ManagerUpdate { ready: false, status: Some("waiting for the first frame".to_owned()) });
+    assert_eq!(
+        scene.tick(0.0),
+        ManagerUpdate { ready: false, status: Some("waiting for the first usable reading".to_owned()) }
+    );
     assert!(!scene.bus(0.1, 0, BusEvent::Up).ready);
     // A frame that carries no configured signal does not count.
     let foreign = leaked(0x7FE, &[1]);
     assert!(!scene.feed(0.1, |time| Record::frame(time, BusIndex(0), foreign)).ready);
     let frame = good_frame();
     let update = scene.feed(0.2, |time| Record::frame(time, BusIndex(0), frame));
-    let status = Some("running: 2 interfaces, first frame after 0.4 s".to_owned());
+    let status = Some("running: 2 interfaces, first reading after 0.4 s".to_owned());
     assert_eq!(update, ManagerUpdate { ready: true, status });
     assert!(!scene.tick(5.0).ready, "readiness is reported once");
 }
@@ -86,13 +89,13 @@ fn service_without_input_is_ready_after_wait() {
     let update = scene.tick(0.1);
     assert!(update.ready);
     let line = update.status.expect("a line");
-    assert_eq!(line, "running without input: no frame in 10 s, restored state 12 s old; can1 is missing");
+    assert_eq!(line, "running without input: no usable reading in 10 s, restored state 12 s old; can1 is missing");
     // The first frame is reported even after the end of the wait.
     let frame = good_frame();
     scene.feed(1.5, |time| Record::frame(time, BusIndex(0), frame));
     assert_eq!(
         scene.readiness.reported,
-        "running: 2 interfaces, first frame after 11.5 s, restored state 12 s old; can1 is missing"
+        "running: 2 interfaces, first reading after 11.5 s, restored state 12 s old; can1 is missing"
     );
 }
 
@@ -122,7 +125,7 @@ fn lost_signals_are_counted_and_named() {
     for _ in 0..20 {
         scene.feed(0.1, |time| Record::frame(time, BusIndex(0), frame));
     }
-    assert_eq!(scene.readiness.reported, "running: 2 interfaces, first frame after 0.0 s");
+    assert_eq!(scene.readiness.reported, "running: 2 interfaces, first reading after 0.0 s");
 }
 
 #[test]
@@ -134,7 +137,7 @@ fn parked_vehicle_is_asleep_without_lost_signals() {
     for _ in 0..20 {
         scene.feed(0.1, |time| Record::frame(time, BusIndex(0), frame));
     }
-    assert_eq!(scene.readiness.reported, "running: 2 interfaces, first frame after 0.0 s");
+    assert_eq!(scene.readiness.reported, "running: 2 interfaces, first reading after 0.0 s");
 }
 
 #[test]

@@ -42,6 +42,10 @@ fn rows() -> Vec<(Value, &'static str)> {
             "remaining life: cell 2, cycles 400, cycles high 500, cycles low 300",
         ),
         (
+            json!({ "event": "outlook", "remaining_energy_wh": 541.0, "energy_to_full_wh": 60.5 }),
+            "outlook: energy to full wh 60.5, remaining energy wh 541",
+        ),
+        (
             json!({ "event": "recharge_period", "seconds": 5000.0, "normalised_s": 5100.0, "normalised_std_s": 50.0 }),
             "recharge period: normalised 5100 ± 50 s, 5000 s",
         ),
@@ -148,7 +152,7 @@ fn rows() -> Vec<(Value, &'static str)> {
 }
 
 #[test]
-fn words_name_cell_interface_and_state_of_each_kind() {
+fn event_words_name_cell_interface_and_state() {
     let mut unseen: BTreeSet<&str> = EventKind::names().iter().copied().collect();
     for (event, expected) in rows() {
         let kind: EventKind = serde_json::from_value(event.clone()).unwrap_or_else(|error| panic!("{event}: {error}"));

@@ -4,7 +4,7 @@ use super::*;
 use crate::alarm::{AlarmState, Change, Rule, Severity};
 use crate::cell::Chemistry;
 use crate::monitor::ModelState;
-use crate::quantity::catalogue::{Quantity, RecordedValues};
+use crate::quantity::catalogue::{Quantity, RecordedPackValues, RecordedValues};
 use crate::quantity::{CellIndex, Mode};
 
 /// A capacity of a cell, with or without a measurement.
@@ -97,6 +97,7 @@ fn every_row_has_a_value_per_column() {
         capacity(3, None, 2.4),
         loss_modes(3, 0.1),
         remaining_life(100.0),
+        EventKind::Outlook { values: RecordedPackValues::default() },
         model(None),
         alarm(Change::Raised),
         EventKind::AlarmDropped {

@@ -7,14 +7,14 @@ use std::borrow::Cow;
 use std::fmt::Write as _;
 use std::sync::LazyLock;
 
-use super::rows::{AlarmRow, EstimateRow, HalfCycleRow, UseRow};
+use super::rows::{AlarmRow, EstimateRow, HalfCycleRow, OutlookRow, UseRow};
 use crate::fleet::vehicle::VehicleRecord;
 
 use crate::cell::LossModes;
 use crate::fields::Fields;
 use crate::health::Remaining;
 use crate::quantity::Timestamp;
-use crate::quantity::catalogue::{Part, Quantity, RECORDED};
+use crate::quantity::catalogue::{Part, Quantity, RECORDED, RECORDED_OF_PACK, RecordedPackValues};
 
 /// Type of a column.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -80,6 +80,8 @@ enum ColumnSource<R> {
     Value(for<'r> fn(&'r R) -> FieldValue<'r>),
     /// A number in the event, found by the name of the column.
     Field(fn(&R) -> &Fields),
+    /// A value of the pack.
+    Quantity(Quantity, Part, fn(&R) -> &RecordedPackValues),
 }
 
 impl<R> Column<R> {
@@ -88,6 +90,9 @@ impl<R> Column<R> {
         match self.source {
             ColumnSource::Value(value) => value(row),
             ColumnSource::Field(fields) => FieldValue::Real(fields(row).number(self.name)),
+            ColumnSource::Quantity(quantity, part, values) => {
+                FieldValue::Real(values(row).get(quantity).and_then(|value| value.part(part)))
+            }
         }
     }
 }
@@ -169,17 +174,42 @@ pub(super) static HALF_CYCLES: LazyLock<Vec<Column<HalfCycleRow>>> = LazyLock::n
 
 /// Returns the columns of a recorded quantity.
 fn recorded(quantity: Quantity) -> impl Iterator<Item = Column<HalfCycleRow>> {
+    let about = quantity.row().cell.map_or("", |it| it.about);
+    columns_of(quantity, about, |_, _| ColumnSource::Field(|row: &HalfCycleRow| &row.capacity))
+}
+
+/// Returns the columns of a quantity: the mean and, if the quantity has one, the standard deviation.
+fn columns_of<R>(
+    quantity: Quantity,
+    about: &'static str,
+    source: impl Fn(Quantity, Part) -> ColumnSource<R>,
+) -> impl Iterator<Item = Column<R>> {
     let row = quantity.row();
-    let about = row.cell.map_or("", |it| it.about);
     row.parts().map(move |(part, name)| Column {
         name,
         unit: row.unit.symbol(),
         kind: ColumnType::Real,
         optional: true,
         about: if part == Part::Std { "its standard deviation" } else { about },
-        source: ColumnSource::Field(|row: &HalfCycleRow| &row.capacity),
+        source: source(quantity, part),
     })
 }
+
+/// Columns of `outlook`.
+pub(super) static OUTLOOK: LazyLock<Vec<Column<OutlookRow>>> = LazyLock::new(|| {
+    let moment = columns! { OutlookRow;
+        "log" Word "", "name of the log and of its folder", |row| text(&row.log);
+        "time" Time "UTC", "end of the half-cycle", |row| FieldValue::Time(row.time);
+        "since_start_s" Real "s", "time since the log's first result", |row| real(row.since_s);
+    };
+    let values = RECORDED_OF_PACK.into_iter().flat_map(|quantity| {
+        let about = quantity.row().pack.map_or("", |it| it.about);
+        columns_of(quantity, about, |quantity, part| {
+            ColumnSource::Quantity(quantity, part, |row: &OutlookRow| &row.values)
+        })
+    });
+    moment.into_iter().chain(values).collect()
+});
 
 /// Columns of `alarms`.
 pub(super) const ALARMS: &[Column<AlarmRow>] = &columns! { AlarmRow;
@@ -280,6 +310,11 @@ pub fn reference() -> String {
         "A charge or discharge of a cell, what was learned from it, and the cell's remaining life after it.",
         &HALF_CYCLES,
     );
+    page += &section(
+        "outlook",
+        "Energy and power of the pack after a charge or discharge, while they are known.",
+        &OUTLOOK,
+    );
     page += &section("alarms", "A change of an alarm.", ALARMS);
     page += &section(
         "use_record",
@@ -319,7 +354,7 @@ mod tests {
 
     #[test]
     fn column_names_are_unique_and_state_the_unit() {
-        for names in [names(ESTIMATES), names(&HALF_CYCLES), names(ALARMS)] {
+        for names in [names(ESTIMATES), names(&HALF_CYCLES), names(&OUTLOOK), names(ALARMS)] {
             assert!(names.iter().enumerate().all(|(index, name)| !names[..index].contains(name)));
         }
         let units = ESTIMATES.iter().map(|c| (c.name, c.unit)).chain(HALF_CYCLES.iter().map(|c| (c.name, c.unit)));

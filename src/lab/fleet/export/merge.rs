@@ -2,7 +2,7 @@
 //! has its own row groups.
 //!
 //! Input: folders written by [`run`](crate::fleet::vehicles::run). Output: `vehicles.parquet` with a row for each
-//! vehicle, including vehicles that failed; `half_cycles.parquet`; `alarms.parquet`; `use_record.parquet`; and, if estimates were exported,
+//! vehicle, including vehicles that failed; `half_cycles.parquet`; `outlook.parquet`; `alarms.parquet`; `use_record.parquet`; and, if estimates were exported,
 //! `estimates.parquet`; and `models.jsonl` with the learned models. The bytes do not depend on which machine replayed a vehicle or on the order of the replays.
 //! Column chunks are copied, so memory does not grow with the number of rows.
 
@@ -10,7 +10,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use super::TableFormat;
-use super::columns::{ALARMS, ESTIMATES, HALF_CYCLES, USE_RECORD, VEHICLES};
+use super::columns::{ALARMS, ESTIMATES, HALF_CYCLES, OUTLOOK, USE_RECORD, VEHICLES};
 use super::table::{TableFile, concatenate};
 use crate::error::{LabError, create_folder};
 use crate::fleet::prior::write_models;
@@ -44,7 +44,7 @@ pub fn merge(folders: &[PathBuf], wanted: Option<&[Vehicle]>, out: &Path) -> Res
     create_folder(out)?;
     let mut summary = MergeSummary { vehicles: vehicles.len(), ..MergeSummary::default() };
     let metadata = [("packwatch.version", env!("CARGO_PKG_VERSION").to_owned())];
-    for table in ["half_cycles", "alarms", "use_record", "estimates"] {
+    for table in ["half_cycles", "outlook", "alarms", "use_record", "estimates"] {
         let has_table = |vehicle: &&VehicleFolder| vehicle.record.rows.contains_key(table);
         let parts: Vec<PathBuf> =
             vehicles.values().filter(has_table).map(|found| found.folder.join(format!("{table}.parquet"))).collect();
@@ -53,6 +53,7 @@ pub fn merge(folders: &[PathBuf], wanted: Option<&[Vehicle]>, out: &Path) -> Res
         if is_wanted {
             let rows = match table {
                 "half_cycles" => concatenate(&path, &parts, &HALF_CYCLES, &metadata)?,
+                "outlook" => concatenate(&path, &parts, &OUTLOOK, &metadata)?,
                 "alarms" => concatenate(&path, &parts, ALARMS, &metadata)?,
                 "use_record" => concatenate(&path, &parts, USE_RECORD, &metadata)?,
                 _ => concatenate(&path, &parts, ESTIMATES, &metadata)?,

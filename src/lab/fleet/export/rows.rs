@@ -10,6 +10,7 @@ use crate::fields::Fields;
 use crate::health::{RemainingLife, UseRecord};
 use crate::monitor::Estimate;
 use crate::quantity::Timestamp;
+use crate::quantity::catalogue::RecordedPackValues;
 
 /// An estimate of a cell.
 pub(super) struct EstimateRow {
@@ -42,6 +43,15 @@ pub(super) struct AlarmRow {
     pub(super) rule: Rule,
     /// Values of the event `Alarm`.
     pub(super) alarm: Fields,
+}
+
+/// Energy and power of the pack after a half-cycle.
+pub(super) struct OutlookRow {
+    pub(super) log: Arc<str>,
+    pub(super) time: Timestamp,
+    pub(super) since_s: f64,
+    /// Values of the event `Outlook`.
+    pub(super) values: RecordedPackValues,
 }
 
 /// A number of the record of use.

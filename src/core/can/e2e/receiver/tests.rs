@@ -215,3 +215,57 @@ fn statuses_serialise_with_number_and_name() {
         assert_eq!(serde_json::to_string(&status).unwrap(), format!("\"{}\"", status.name()));
     }
 }
+
+#[test]
+fn only_intact_frames_in_sequence_are_usable() {
+    let usable: Vec<_> = Status::ALL.into_iter().filter(|status| status.is_usable()).collect();
+    assert_eq!(usable, [Status::Ok, Status::Sync, Status::OkSomeLost]);
+}
+
+#[test]
+fn every_check_and_missed_period_is_counted() {
+    let config = config(Profile::P01A, 0);
+    let mut receiver = Receiver::default();
+    for what in [Input::Same, Input::Next, Input::Damaged, Input::Short] {
+        apply(&mut receiver, &config, what);
+    }
+    receiver.no_new_data(&config, 3);
+    let expected = [1, 3, 2, 0, 1, 0, 0, 0];
+    let counts = receiver.counts();
+    assert_eq!(counts.iter().collect::<Vec<_>>(), Status::ALL.into_iter().zip(expected).collect::<Vec<_>>());
+    assert_eq!(counts.total(), 7);
+}
+
+#[test]
+fn resumed_receiver_continues_stored_sequence_with_own_counts() {
+    let config = config(Profile::P01A, 0);
+    let mut stored = in_state(State::Following);
+    assert_eq!(stored.check(&config, &frame(&config, 8)), Status::Ok);
+    let mut receiver = Receiver::default();
+    assert_eq!(receiver.next_counter(Profile::P01A), None, "no frame yet");
+    assert_eq!(receiver.check(&config, &frame(&config, 3)), Status::Initial);
+    receiver.resume(Profile::P01A, &stored);
+    assert_eq!(receiver.next_counter(Profile::P01A), Some(9));
+    assert_eq!(receiver.check(&config, &frame(&config, 9)), Status::Ok);
+    let counts = receiver.counts();
+    assert_eq!((counts.get(Status::Initial), counts.get(Status::Ok), counts.total()), (1, 1, 2));
+}
+
+#[test]
+fn impossible_stored_counter_waits_for_first_frame() {
+    for (stored, next) in [(14, Some(0)), (15, None), (255, None)] {
+        let mut receiver = Receiver::default();
+        receiver.resume(Profile::P01A, &Receiver { last_valid: Some(stored), ..Receiver::default() });
+        assert_eq!(receiver.next_counter(Profile::P01A), next, "stored counter {stored}");
+    }
+}
+
+#[test]
+fn silence_up_to_limit_needs_no_synchronisation() {
+    let config = config(Profile::P01A, 2);
+    for (periods, status) in [(3, Status::Ok), (4, Status::Sync)] {
+        let mut receiver = in_state(State::Following);
+        receiver.no_new_data(&config, periods);
+        assert_eq!(receiver.check(&config, &frame(&config, LAST + 1)), status, "{periods} periods without a frame");
+    }
+}

@@ -1,24 +1,29 @@
 //! Compares the steps of the measured current with the steps of the cells' voltages.
 //!
-//! In: *rounds* (the voltages of the cells, read one after another, and the current at that time), and the series
-//! resistance according to the model. Out: whether the current is doubtful.
+//! In: samples of the compared cells, and the series resistance according to the model. Out: whether the current is
+//! doubtful.
+//!
+//! A *round* contains one sample of each cell, and the mean current of these samples. A round is complete when all cells
+//! of the previous round have reported. If one of them is missing, the round ends when another cell reports again, after
+//! a pause ([`PAUSE_SHARE`]) or after [`MAX_ROUND_S`].
 //!
 //! A step of the current moves the voltages of all cells in the opposite direction, by the resistance times the step.
 //! The check judges each clear step between two steady levels of the voltages. The step is *explained* if the current
-//! has stepped in the opposite direction, and if the ratio of the two steps (a resistance) is at least 1/[`MAX_FACTOR`]
-//! and at most [`MAX_FACTOR`] times the usual resistance. A step is the mean of two consecutive rounds minus the mean
+//! has stepped in the opposite direction, and if the ratio of the two steps, a resistance, is right. It must lie between
+//! the usual resistance divided by [`MAX_FACTOR`] and the usual resistance times [`MAX_FACTOR`]. A step is the mean of two consecutive rounds minus the mean
 //! of the two rounds before them. Such a step contains less noise than the difference of two readings. A current that
 //! arrives one round earlier or later than the voltages still explains their step.
 //!
 //! Explained and unexplained steps are evidence for and against the sensor. How much they count depends on how many
-//! steps the sensor has left unexplained so far. If a sensor has explained all steps, one unexplained step is enough
-//! for a doubt, because the charge is wrong from the first second. A logger that reads current and voltages seconds
+//! steps the sensor has left unexplained so far. If a sensor has explained all steps, one unexplained step makes the
+//! current doubtful: a wrong current falsifies the counted charge at once. A logger that reads current and voltages seconds
 //! apart leaves many steps unexplained, so one more is only weak evidence.
 //!
 //! The check finds a current that is frozen, inverted, late or beyond the sensor's range, whether or not the last
 //! digits of its readings change. While the load is constant, it finds only a noisy sensor at its limit ([`SensorLimit`]).
-//! A current without sign is found at the first clear steps of a charging current. If a doubted current has never flowed
-//! in both directions, the doubt only ends when it has. A current without sign therefore stays doubtful.
+//! A current without sign is found at the first clear steps of a charging current. If a doubted current has flowed in
+//! only one direction, the doubt ends only after the current has flowed in both. A current without sign therefore stays
+//! doubtful.
 
 mod sensor_limit;
 
@@ -51,16 +56,22 @@ const MIN_STEP_V: f64 = 0.01;
 const STEP_SIGMA: f64 = 5.0;
 /// Smallest clear step, as a multiple of the resolution of the voltages.
 const STEP_READINGS: f64 = 1.5;
-/// Smallest clear step, as a multiple of the usual change between two rounds.
+/// Smallest clear step, as a multiple of the usual change that the current does not explain.
 const STEP_MOVES: f64 = 9.0;
-/// Factor by which each round raises or lowers the usual change, which thus follows the median.
+/// Factor by which each round raises or lowers the usual unexplained change, which thus follows the median.
 const MOVE_GAIN: f64 = 1.02;
-/// Range of the usual change between two rounds (V).
+/// Range of the usual unexplained change (V).
 const MOVE_V: (f64, f64) = (1e-4, 0.05);
-/// Usual change before the first rounds (V). It exceeds the noise of any sensor.
+/// Usual unexplained change before the first rounds (V). It exceeds the noise of any sensor.
 const FIRST_MOVE_V: f64 = 0.01;
 /// Weight of an explained step in the usual resistance (as ln).
 const RATIO_GAIN: f64 = 0.1;
+/// Longest time from the first to the last sample of a round (s). In a longer round, the cells were read at different
+/// currents.
+const MAX_ROUND_S: f64 = 1.0;
+/// A pause of this share of the time between the beginnings of two rounds ends a round: the frames of the next round
+/// follow.
+const PAUSE_SHARE: f64 = 0.75;
 /// Longest time between two rounds (s). After a longer pause, the steps are not compared.
 const MAX_PAUSE_S: f64 = 60.0;
 /// Part of the earlier doubts that remains after an explained step.
@@ -77,13 +88,52 @@ const COARSE_V: f64 = 0.05;
 pub(crate) const MAX_CELLS: usize = 15;
 const ROUNDS: usize = 4;
 
-/// One round of voltages.
+/// The round whose samples are arriving.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct OpenRound {
+    /// Voltage of each compared cell (V); `None` = not reported yet.
+    voltages_v: [Option<f64>; MAX_CELLS],
+    /// Time of the first sample; `None` = no sample yet.
+    began: Option<Timestamp>,
+    /// Time of the latest sample.
+    time: Timestamp,
+    /// Current of the latest sample (A); `None` = unknown.
+    latest_a: Option<f64>,
+    /// Sum and number of the known currents of the samples (A).
+    sum_a: f64,
+    known: u32,
+}
+
+impl OpenRound {
+    fn is_empty(&self) -> bool {
+        self.began.is_none()
+    }
+
+    fn add(&mut self, place: usize, sample: &CellSample) {
+        self.voltages_v[place] = Some(sample.voltage_v);
+        self.began.get_or_insert(sample.time);
+        (self.time, self.latest_a) = (sample.time, sample.current_a);
+        if let Some(current_a) = sample.current_a {
+            (self.sum_a, self.known) = (self.sum_a + current_a, self.known + 1);
+        }
+    }
+
+    fn has_all_of(&self, others: &[Option<f64>; MAX_CELLS]) -> bool {
+        self.voltages_v.iter().zip(others).all(|(found, other)| found.is_some() || other.is_none())
+    }
+}
+
+/// A complete round.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Round {
     time: Timestamp,
-    /// Current of a cell (A).
+    /// Mean current of a cell (A).
     current_a: f64,
+    /// Latest current of a cell (A).
+    #[serde(default)]
+    latest_a: f64,
     /// Common change of the voltages since the previous round (V).
     move_v: f64,
 }
@@ -94,6 +144,11 @@ struct Round {
 pub(crate) struct CurrentCheck {
     /// Voltage of each compared cell in the latest round (V); `None` = no reading.
     voltages_v: [Option<f64>; MAX_CELLS],
+    /// Time of the first sample of the latest round; `None` = no round.
+    #[serde(default)]
+    began: Option<Timestamp>,
+    #[serde(default, skip_serializing_if = "OpenRound::is_empty")]
+    open: OpenRound,
     /// The latest rounds, the oldest first.
     rounds: [Round; ROUNDS],
     /// Number of valid rounds, counted from the latest.
@@ -116,9 +171,12 @@ pub(crate) struct CurrentCheck {
     limit: SensorLimit,
     /// Number of earlier doubts; explained steps reduce it.
     doubts: f64,
+    /// Number of cells whose SOC has jumped since all cells last reported.
+    #[serde(default)]
+    jumped: usize,
     /// Whether a jump of the SOC in a downtime waits for an explained step.
     is_unconfirmed: bool,
-    /// Whether the current has been contradicted before it has flowed in both directions, and has not done so since.
+    /// Whether the current was contradicted and has still not flowed in both directions.
     is_one_sided: bool,
 }
 
@@ -126,6 +184,8 @@ impl Default for CurrentCheck {
     fn default() -> Self {
         Self {
             voltages_v: [None; MAX_CELLS],
+            began: None,
+            open: OpenRound::default(),
             rounds: [Round::default(); ROUNDS],
             count: 0,
             evidence: 0.0,
@@ -137,6 +197,7 @@ impl Default for CurrentCheck {
             resolution_v: COARSE_V,
             limit: SensorLimit::default(),
             doubts: 0.0,
+            jumped: 0,
             is_unconfirmed: false,
             is_one_sided: false,
         }
@@ -154,10 +215,25 @@ impl CurrentCheck {
         self.evidence > DOUBTFUL
     }
 
-    /// Handles a jump of the SOC in a downtime: the cells may have been used, or a sensor may have failed. The next
-    /// explained step of the current decides. If no step has ever been judged, the check waits for none.
-    pub(crate) fn demand_step(&mut self) {
+    /// Handles a jump of the SOC in a downtime: the cells may have been used, or a sensor may have failed. The SOC
+    /// stays unconfirmed until a step of the current is explained. If no step has ever been judged, the SOC counts as
+    /// confirmed.
+    fn demand_step(&mut self) {
         self.is_unconfirmed = self.steps != FIRST_STEPS;
+    }
+
+    /// Notes that the SOC of `count` cells has jumped. If it has jumped in more than half of all `cells` since all cells
+    /// last reported, demands a step.
+    pub(crate) fn note_jumps(&mut self, count: usize, cells: usize) {
+        self.jumped = self.jumped.saturating_add(count);
+        if count > 0 && 2 * self.jumped.min(cells) > cells {
+            self.demand_step();
+        }
+    }
+
+    /// Forgets the jumps, because all cells have reported.
+    pub(crate) fn forget_jumps(&mut self) {
+        self.jumped = 0;
     }
 
     /// Whether the SOC has jumped in a downtime, and no step of the current has been explained since.
@@ -165,9 +241,9 @@ impl CurrentCheck {
         self.is_unconfirmed
     }
 
-    /// Handles a round. `samples`: the compared cells that have reported, each with its place (below [`MAX_CELLS`]).
-    /// `noise_v`: standard deviation of a reading. `ohm`: the model's series resistance. `rest_a`: largest current at
-    /// rest.
+    /// Handles samples of a round, or of a part of it. `samples`: the compared cells that have reported, each with its
+    /// place (below [`MAX_CELLS`]). `noise_v`: standard deviation of a reading. `ohm`: the model's series resistance.
+    /// `rest_a`: largest current at rest.
     pub(crate) fn handle<'a>(
         &mut self,
         samples: impl Iterator<Item = (usize, &'a CellSample)>,
@@ -175,28 +251,52 @@ impl CurrentCheck {
         ohm: f64,
         rest_a: f64,
     ) {
-        let (mut moves_v, mut moves, mut latest) = ([0.0; MAX_CELLS], 0, None);
-        // Skips cells without a reading in the previous round: their change spans more than one round.
-        let before_v = std::mem::replace(&mut self.voltages_v, [None; MAX_CELLS]);
+        let mut has_samples = false;
         for (place, sample) in samples {
-            latest = Some(sample);
-            self.voltages_v[place] = Some(sample.voltage_v);
-            if let Some(before_v) = before_v[place] {
-                moves_v[moves] = sample.voltage_v - before_v;
-                if moves_v[moves] != 0.0 {
-                    self.resolution_v = self.resolution_v.min(moves_v[moves].abs());
-                }
-                moves += 1;
+            // A cell that was missing in the round before the latest one can report after the others.
+            let is_recent = |began: Timestamp| (0.0..MAX_ROUND_S).contains(&sample.time.since(began));
+            if self.open.began.is_none() && self.voltages_v[place].is_none() && self.began.is_some_and(is_recent) {
+                self.voltages_v[place] = Some(sample.voltage_v);
+                continue;
             }
+            let has_paused = |began: Timestamp| {
+                let cycle_s = self.began.map_or(f64::INFINITY, |before| began.since(before));
+                sample.time.since(self.open.time) > PAUSE_SHARE * cycle_s
+            };
+            let has_ended = |began: Timestamp| !is_recent(began) || has_paused(began);
+            if self.open.voltages_v[place].is_some() || self.open.began.is_some_and(has_ended) {
+                self.end_round(noise_v, ohm, rest_a);
+            }
+            self.open.add(place, sample);
+            has_samples = true;
         }
-        let Some(&CellSample { time, current_a, .. }) = latest else { return };
+        if has_samples && self.voltages_v != [None; MAX_CELLS] && self.open.has_all_of(&self.voltages_v) {
+            self.end_round(noise_v, ohm, rest_a);
+        }
+    }
+
+    /// Ends the open round and compares it with the rounds before it.
+    fn end_round(&mut self, noise_v: f64, ohm: f64, rest_a: f64) {
+        let OpenRound { voltages_v, began, time, latest_a, sum_a, known } = std::mem::take(&mut self.open);
+        let before_v = std::mem::replace(&mut self.voltages_v, voltages_v);
+        self.began = began;
+        let (mut moves_v, mut moves) = ([0.0; MAX_CELLS], 0);
+        // Skips cells without a reading in the previous round: their change spans more than one round.
+        for (before_v, voltage_v) in before_v.into_iter().zip(voltages_v).filter_map(|(a, b)| a.zip(b)) {
+            moves_v[moves] = voltage_v - before_v;
+            if moves_v[moves] != 0.0 {
+                self.resolution_v = self.resolution_v.min(moves_v[moves].abs());
+            }
+            moves += 1;
+        }
         let move_v = common_move(&mut moves_v[..moves]);
         self.path_v += move_v;
         if moves > 1 {
             self.scatter_v += SCATTER_GAIN * (scatter(&mut moves_v[..moves], move_v) - self.scatter_v);
         }
-        let is_late = self.count > 0 && time.since(self.rounds[ROUNDS - 1].time) > MAX_PAUSE_S;
-        let Some(current_a) = current_a.filter(|_| !is_late && moves > 0) else {
+        // If the clock was set back, the time between the rounds is unknown.
+        let is_late = self.count > 0 && !(0.0..=MAX_PAUSE_S).contains(&time.since(self.rounds[ROUNDS - 1].time));
+        let Some(latest_a) = latest_a.filter(|_| !is_late && moves > 0) else {
             self.count = 0;
             if is_late {
                 self.limit.pause();
@@ -204,14 +304,15 @@ impl CurrentCheck {
             return;
         };
         self.rounds.rotate_left(1);
-        self.rounds[ROUNDS - 1] = Round { time, current_a, move_v };
+        let current_a = sum_a / f64::from(known);
+        self.rounds[ROUNDS - 1] = Round { time, current_a, latest_a, move_v };
         self.count = (self.count + 1).min(ROUNDS);
         if self.count == ROUNDS {
             self.judge(noise_v, ohm * libm::exp(self.log_ratio));
         }
         if self.count >= 2 {
             let is_steady = move_v.abs() <= self.usual_v.max(self.resolution_v);
-            let evidence = self.limit.judge(self.rounds[ROUNDS - 2].current_a, current_a, is_steady);
+            let evidence = self.limit.judge(self.rounds[ROUNDS - 2].latest_a, latest_a, is_steady);
             self.add_evidence(evidence);
         }
         self.is_one_sided = !self.limit.has_seen_both(rest_a) && (self.is_one_sided || self.is_contradicted());
@@ -285,15 +386,19 @@ impl CurrentCheck {
 
     /// Forgets the latest rounds, because the next reading comes after a pause. The evidence stays.
     pub(crate) fn interrupt(&mut self) {
-        (self.voltages_v, self.rounds, self.count) = ([None; MAX_CELLS], [Round::default(); ROUNDS], 0);
+        (self.voltages_v, self.began, self.open) = ([None; MAX_CELLS], None, OpenRound::default());
+        (self.rounds, self.count) = ([Round::default(); ROUNDS], 0);
         self.limit.pause();
     }
 
     /// Checks a stored state; the error is the first impossible number.
     pub(crate) fn check(&self) -> Result<(), InvalidState> {
-        bounds::VOLTAGE_V.check_all("a voltage of the check of the current", self.voltages_v.into_iter().flatten())?;
-        bounds::CURRENT_A
-            .check_all("a current of the check of the current", self.rounds.map(|round| round.current_a))?;
+        let voltages_v = self.voltages_v.into_iter().chain(self.open.voltages_v).flatten();
+        bounds::VOLTAGE_V.check_all("a voltage of the check of the current", voltages_v)?;
+        let OpenRound { latest_a, sum_a, .. } = self.open;
+        bounds::NUMBER.check_all("a current of the check of the current", [sum_a])?;
+        let currents_a = self.rounds.iter().flat_map(|round| [round.current_a, round.latest_a]).chain(latest_a);
+        bounds::CURRENT_A.check_all("a current of the check of the current", currents_a)?;
         let numbers = self.rounds.map(|round| round.move_v);
         bounds::NUMBER.check_all("a voltage step of the check of the current", numbers)?;
         let [unexplained, explained] = self.steps;
@@ -315,6 +420,9 @@ impl CurrentCheck {
 
     /// Shifts all timestamps by `by_nanos`, to another clock.
     pub(crate) fn rebase(&mut self, by_nanos: i64) {
+        self.began = self.began.map(|began| began.plus_nanos(by_nanos));
+        self.open.began = self.open.began.map(|began| began.plus_nanos(by_nanos));
+        self.open.time = self.open.time.plus_nanos(by_nanos);
         self.rounds.iter_mut().for_each(|round| round.time = round.time.plus_nanos(by_nanos));
     }
 }

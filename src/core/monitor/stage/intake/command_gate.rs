@@ -146,3 +146,6 @@ impl CommandGate {
         InvalidState::unless(self.window.is_possible(), "the freshness of commands", found, allowed)
     }
 }
+
+#[cfg(test)]
+mod tests;
