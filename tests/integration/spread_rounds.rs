@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 
 use packwatch::can::decode::Channel;
 use packwatch::can::encode::InputEncoder;
-use packwatch::monitor::{Monitor, MonitorConfig, Outputs, Record, RecordKind};
+use packwatch::monitor::{Command, Monitor, MonitorConfig, Outputs, Record, RecordKind};
 use packwatch::quantity::{CellIndex, SensorIndex, Timestamp};
 
 use crate::support::config_texts;
@@ -87,17 +87,19 @@ fn give(monitor: &mut Monitor, encoder: &InputEncoder, second: u32, current_a: f
 }
 
 #[test]
-fn voltages_before_and_after_unknown_gap_are_not_compared() {
-    let config = config("");
-    let encoder = InputEncoder::new(&config.input);
-    let mut monitor = Monitor::new(config);
-    for second in 0..60 {
-        give(&mut monitor, &encoder, second, 1.0, 3.60);
-    }
-    let mut out = Outputs::default();
-    monitor.handle(&Record { time: Timestamp::from_secs(60.0), kind: RecordKind::UnknownGap }, &mut out);
-    for second in 61..90 {
-        give(&mut monitor, &encoder, second, 1.0, 3.75);
-        assert!(monitor.cell_views().all(|cell| cell.trusted != Some(false)), "{second}");
+fn voltages_before_and_after_interruption_are_not_compared() {
+    let time = Timestamp::from_secs(60.0);
+    for interruption in [Record { time, kind: RecordKind::UnknownGap }, Record::command(time, Command::PackReplaced)] {
+        let config = config("");
+        let encoder = InputEncoder::new(&config.input);
+        let mut monitor = Monitor::new(config);
+        for second in 0..60 {
+            give(&mut monitor, &encoder, second, 1.0, 3.60);
+        }
+        monitor.handle(&interruption, &mut Outputs::default());
+        for second in 61..90 {
+            give(&mut monitor, &encoder, second, 1.0, 3.75);
+            assert!(monitor.cell_views().all(|cell| cell.trusted != Some(false)), "{interruption:?}: {second}");
+        }
     }
 }
