@@ -24,8 +24,8 @@ use crate::quantity::{CellIndex, InvalidState, Mode, Timestamp};
 pub const POWER_S: [f64; 3] = [2.0, 10.0, 30.0];
 /// Time over which the load of a discharge is averaged (s). Over half an hour, fast and slow parts of a drive mix.
 const LOAD_S: f64 = 1800.0;
-/// Standard deviation of ln(charging time that the taper adds). It is large, because the current of a model without a slow
-/// branch falls too fast.
+/// Standard deviation of ln(charging time that the taper adds). It is large, because the current of a model without a
+/// slow branch falls too fast.
 const LOG_HELD_STD: f64 = 0.7;
 /// A load is known if its mean is at least this share of its RMS value. If the mean is smaller, charge and discharge
 /// alternate, as in a hybrid, and no time to empty can be forecast.
@@ -107,8 +107,8 @@ impl Average {
 }
 
 impl RecentLoad {
-    /// Adds the current of a cell at `now`; `None` = the current is unknown. If the mode is rest or unknown, a current of at
-    /// most `rest_a` is not averaged.
+    /// Adds the current of a cell at `now`; `None` = the current is unknown. If the mode is rest or unknown, a current of
+    /// at most `rest_a` is not averaged.
     pub fn observe(&mut self, now: Timestamp, mode: Mode, current_a: Option<f64>, rest_a: f64) {
         let seconds = self.latest.map_or(0.0, |latest| now.since(latest));
         self.latest = Some(now);
@@ -171,8 +171,8 @@ impl Load {
         Self { peak_a: rated_ah, ..Self::constant(USUAL_LOAD_PER_H * rated_ah) }
     }
 
-    /// Energy lost per charge (V). The mean current meets the settled resistance, the fluctuations of the current meet the
-    /// fast resistance.
+    /// Energy lost per charge (V). The mean current flows through the settled resistance. The fluctuations of the
+    /// current flow through the fast resistance.
     fn loss_v(&self, settled_ohm: f64, fast_ohm: f64) -> f64 {
         let fluctuation_a = (self.mean_square_a2 - square(self.mean_a)) / self.mean_a;
         self.mean_a * settled_ohm + fluctuation_a * fast_ohm
@@ -428,7 +428,8 @@ pub fn of_pack(
     let drawn = discharge.unwrap_or(Load::usual(rated_ah));
     let charger = load.charger_a(mode);
     let charger_a = charger.unwrap_or(USUAL_LOAD_PER_H * rated_ah);
-    // If the charger delivers less than the taper current, the charge ends when the first cell reaches its highest voltage.
+    // If the charger delivers less than the taper current, the charge ends when the first cell reaches its highest
+    // voltage.
     let config = &OutlookConfig { taper_current_a: config.taper_current_a.min(charger_a), ..*config };
     let least = |value: &dyn Fn(&CellNow<'_>) -> f64| {
         cells.iter().map(|cell| (value(cell), cell)).min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, cell)| cell)

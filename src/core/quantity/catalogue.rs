@@ -286,7 +286,8 @@ impl<'de, const IS_PACK: bool> Deserialize<'de> for Values<IS_PACK> {
 /// Quantities recorded after each half-cycle of a cell: in the event `capacity`, in the history and in exported tables.
 pub const RECORDED: [Quantity; 3] = [Quantity::Capacity, Quantity::UsableCapacity, Quantity::ResistanceRatio];
 
-/// Quantities recorded after each half-cycle of the pack: in the event `outlook`, in the history and in exported tables.
+/// Quantities recorded after each half-cycle of the pack: in the event `outlook`, in the history and in exported
+/// tables.
 pub const RECORDED_OF_PACK: [Quantity; 5] = [
     Quantity::RemainingEnergy,
     Quantity::EnergyToFull,

@@ -1,8 +1,8 @@
 //! Exports the results of logs as tables of estimates, half-cycles, energies and alarms, in Parquet or CSV format.
 //!
-//! Input: a configuration and logs. Output: for each log, a folder `NAME/` with `estimates`, `half_cycles`, `outlook`, `alarms` and
-//! `use_record` (`.parquet` or `.csv`; see [`columns`] for columns and units), and with `about.json`. `about.json` is written last:
-//! if it exists, the tables are complete. A file gets its final name only when it is complete. Memory holds one row
+//! Input: a configuration and logs. Output: for each log, a folder `NAME/` with `estimates`, `half_cycles`, `outlook`,
+//! `alarms` and `use_record` (`.parquet` or `.csv`; see [`columns`] for columns and units), and with `about.json`.
+//! `about.json` is written last: if it exists, the tables are complete. A file gets its final name only when it is complete. Memory holds one row
 //! group per table and log, no matter how long the log is. If a log cannot be replayed, its folder gets no new file,
 //! and the other logs continue.
 

@@ -315,8 +315,8 @@ pub fn write(path: &Path, data: &ColumnTable, forecast: &TableForecast) -> Resul
     write_csv(path, heads.map(str::to_owned).to_vec(), rows)
 }
 
-/// Divides the rows into equal stretches and returns a row of each, at most `most` different rows. The position of this row
-/// differs between stretches. If rows repeat, for example in cycles, a fixed position would always select rows of the
+/// Divides the rows into equal stretches and returns a row of each, at most `most` different rows. The position of this
+/// row differs between stretches. If rows repeat, for example in cycles, a fixed position would always select rows of the
 /// same phase.
 fn chosen(all: &[usize], most: usize) -> Vec<usize> {
     let count = all.len().min(most);

@@ -166,7 +166,8 @@ impl Estimation {
         self.note_checks();
     }
 
-    /// Whether the current is doubtful, or the SOC has jumped and no explained step of the current has confirmed it since.
+    /// Whether the current is doubtful, or the SOC has jumped and no explained step of the current has confirmed it
+    /// since.
     pub(crate) fn is_doubtful(&self) -> bool {
         self.is_current_doubtful || self.current_check.is_unconfirmed()
     }

@@ -1,7 +1,7 @@
 //! Sampling stage: turns readings into cell samples, and detects which pack is connected.
 //!
-//! In: decoded readings, each a value or a fault. Out: a [`CellSample`] for each good voltage, an event for each signal that turns bad or good,
-//! and the pack's identity once enough consecutive readings agree. Bad readings of the identity are ignored. The
+//! In: decoded readings, each a value or a fault. Out: a [`CellSample`] for each good voltage, an event for each signal
+//! that turns bad or good, and the pack's identity once enough consecutive readings agree. Bad readings of the identity are ignored. The
 //! identity is stored, so that an exchange of the pack during a downtime is detected.
 
 use serde::{Deserialize, Serialize};

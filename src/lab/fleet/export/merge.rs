@@ -2,9 +2,9 @@
 //! has its own row groups.
 //!
 //! Input: folders written by [`run`](crate::fleet::vehicles::run). Output: `vehicles.parquet` with a row for each
-//! vehicle, including vehicles that failed; `half_cycles.parquet`; `outlook.parquet`; `alarms.parquet`; `use_record.parquet`; and, if estimates were exported,
-//! `estimates.parquet`; and `models.jsonl` with the learned models. The bytes do not depend on which machine replayed a vehicle or on the order of the replays.
-//! Column chunks are copied, so memory does not grow with the number of rows.
+//! vehicle, including vehicles that failed; `half_cycles.parquet`; `outlook.parquet`; `alarms.parquet`;
+//! `use_record.parquet`; and, if estimates were exported, `estimates.parquet`; and `models.jsonl` with the learned
+//! models. The bytes do not depend on which machine replayed a vehicle or on the order of the replays. Column chunks are copied, so memory does not grow with the number of rows.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};

@@ -3,21 +3,22 @@
 //! In: samples of the compared cells, and the series resistance according to the model. Out: whether the current is
 //! doubtful.
 //!
-//! A *round* contains one sample of each cell, and the mean current of these samples. A round is complete when all cells
-//! of the previous round have reported. If one of them is missing, the round ends when another cell reports again, after
-//! a pause ([`PAUSE_SHARE`]) or after [`MAX_ROUND_S`].
+//! A *round* contains one sample of each cell, and the mean current of these samples. A round is complete when all
+//! cells of the previous round have reported. If one of them is missing, the round ends when another cell reports again,
+//! after a pause ([`PAUSE_SHARE`]) or after [`MAX_ROUND_S`].
 //!
 //! A step of the current moves the voltages of all cells in the opposite direction, by the resistance times the step.
 //! The check judges each clear step between two steady levels of the voltages. The step is *explained* if the current
-//! has stepped in the opposite direction, and if the ratio of the two steps, a resistance, is right. It must lie between
-//! the usual resistance divided by [`MAX_FACTOR`] and the usual resistance times [`MAX_FACTOR`]. A step is the mean of two consecutive rounds minus the mean
-//! of the two rounds before them. Such a step contains less noise than the difference of two readings. A current that
-//! arrives one round earlier or later than the voltages still explains their step.
+//! has stepped in the opposite direction, and if the ratio of the two steps is plausible. This ratio is a resistance. It
+//! must lie between the usual resistance divided by [`MAX_FACTOR`] and the usual resistance times [`MAX_FACTOR`]. A step
+//! is the mean of two consecutive rounds minus the mean of the two rounds before them. Such a step contains less noise
+//! than the difference of two readings. A current that arrives one round earlier or later than the voltages still
+//! explains their step.
 //!
 //! Explained and unexplained steps are evidence for and against the sensor. How much they count depends on how many
 //! steps the sensor has left unexplained so far. If a sensor has explained all steps, one unexplained step makes the
-//! current doubtful: a wrong current falsifies the counted charge at once. A logger that reads current and voltages seconds
-//! apart leaves many steps unexplained, so one more is only weak evidence.
+//! current doubtful: a wrong current falsifies the counted charge at once. A logger that reads current and voltages
+//! seconds apart leaves many steps unexplained, so one more is only weak evidence.
 //!
 //! The check finds a current that is frozen, inverted, late or beyond the sensor's range, whether or not the last
 //! digits of its readings change. While the load is constant, it finds only a noisy sensor at its limit ([`SensorLimit`]).
@@ -222,8 +223,8 @@ impl CurrentCheck {
         self.is_unconfirmed = self.steps != FIRST_STEPS;
     }
 
-    /// Notes that the SOC of `count` cells has jumped. If it has jumped in more than half of all `cells` since all cells
-    /// last reported, demands a step.
+    /// Notes that the SOC of `count` cells has jumped. If the SOC of more than half of all `cells` has jumped since all
+    /// cells last reported, demands a step.
     pub(crate) fn note_jumps(&mut self, count: usize, cells: usize) {
         self.jumped = self.jumped.saturating_add(count);
         if count > 0 && 2 * self.jumped.min(cells) > cells {
