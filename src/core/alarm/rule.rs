@@ -51,6 +51,8 @@ pub enum Rule {
     /// A voltage channel does not show its own cell. The value is 1 in this case, else 0. While the value is 1, the
     /// rules that depend on the cell's voltage are unknown.
     ChannelFaulty = 17,
+    /// A cell's voltage collapses (1), a temperature of the cell rises without a current (2), or both (3); else 0.
+    ThermalEvent = 18,
 }
 
 /// Scope of a rule: the pack as a whole, its cells, or both.
@@ -125,7 +127,7 @@ pub struct RuleSpec {
 
 impl Rule {
     /// Every rule, in the order of the wire codes.
-    pub const ALL: [Self; 17] = [
+    pub const ALL: [Self; 18] = [
         Self::CapacityLow,
         Self::UsableCapacityLow,
         Self::RechargePeriodLow,
@@ -143,6 +145,7 @@ impl Rule {
         Self::CellLeak,
         Self::ConnectionResistance,
         Self::ChannelFaulty,
+        Self::ThermalEvent,
     ];
 
     /// The rule with a wire code; `None` = no such rule.
@@ -154,6 +157,7 @@ impl Rule {
     pub fn with_unit(self, value: f64) -> String {
         let unit = self.spec().unit;
         match unit {
+            Unit::Ratio if self == Self::ThermalEvent && value >= 1.0 => evidence_words(value).to_owned(),
             Unit::Fraction => format!("{:.1} %", 100.0 * value),
             Unit::FractionPerDay => format!("{:.3} %/d", 100.0 * value),
             Unit::Ratio => format!("{value:.2}"),
@@ -182,6 +186,7 @@ impl Rule {
             Self::CellLeak => "cell_leak",
             Self::ConnectionResistance => "connection_resistance",
             Self::ChannelFaulty => "channel_faulty",
+            Self::ThermalEvent => "thermal_event",
         }
     }
 
@@ -229,8 +234,20 @@ impl Rule {
                 (Cell, Above, Fraction, true, true, "a cell's contact resistance in excess of the other cells")
             }
             Self::ChannelFaulty => (Cell, Above, Fraction, false, false, "whether a voltage channel is faulty"),
+            Self::ThermalEvent => (Cell, Above, Ratio, false, true, "the evidence of a thermal event"),
         };
         RuleSpec { scope, direction, unit, has_deviation, is_learned, about }
+    }
+}
+
+/// Words for the value of [`Rule::ThermalEvent`].
+fn evidence_words(value: f64) -> &'static str {
+    if value < 2.0 {
+        "its voltage collapses"
+    } else if value < 3.0 {
+        "its temperature rises without a current"
+    } else {
+        "its voltage collapses and its temperature rises"
     }
 }
 
@@ -272,6 +289,6 @@ mod tests {
             assert_eq!(Rule::from_number(number), Some(rule));
             assert_eq!(serde_json::to_value(rule).expect("a word"), rule.name());
         }
-        assert_eq!((Rule::from_number(0), Rule::from_number(18)), (None, None));
+        assert_eq!((Rule::from_number(0), Rule::from_number(19)), (None, None));
     }
 }

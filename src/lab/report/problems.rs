@@ -370,6 +370,7 @@ fn alarm_sentence(group: &AlarmGroup<'_>, data: &Data, context: &PageContext<'_>
         Rule::InputMissing => return format!("Readings of {whose} are missing."),
         Rule::InputImplausible => return format!("Readings of {whose} are implausible."),
         Rule::ChannelFaulty => return format!("The voltage channel of {whose} does not show its cell."),
+        Rule::ThermalEvent => return format!("A thermal event has begun at {whose}: {}.", said(group.alarms[0])),
         _ => {}
     }
     let spec = rule.spec();
@@ -398,6 +399,11 @@ fn alarm_sentence(group: &AlarmGroup<'_>, data: &Data, context: &PageContext<'_>
     }
 }
 
+/// The value with which an alarm was raised, in words.
+fn said(alarm: &ActiveAlarm<'_>) -> String {
+    alarm.row.value.map_or_else(|| "unknown".to_owned(), |value| Rule::ThermalEvent.with_unit(value))
+}
+
 fn condition_of(severity: &str) -> Condition {
     [Condition::Watch, Condition::Plan, Condition::Act][rank(severity).min(2)]
 }
@@ -418,6 +424,10 @@ const fn concerns_measurement(rule: Rule) -> bool {
 
 const fn alarm_advice(rule: Rule, condition: Condition) -> &'static str {
     match rule {
+        Rule::ThermalEvent => {
+            "Leave the vehicle, keep people away, and call the fire brigade. Do not charge or drive it again before the \
+             named cell has been examined."
+        }
         Rule::TemperatureHigh => "Check cooling and load before the next use.",
         Rule::SocLow => "Charge it.",
         Rule::CellImbalance => "Have the cells balanced; if the imbalance returns, have the weakest cell checked.",

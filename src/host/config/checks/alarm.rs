@@ -89,7 +89,7 @@ impl Alarm {
                 when: self.when,
                 debounce_s: self.debounce_s,
                 debounce_events: self.debounce_events,
-                is_latching: self.latched,
+                is_latching: self.latched.unwrap_or(self.rule == Rule::ThermalEvent),
             })
         };
         self.thresholds().filter_map(rule).collect()
