@@ -9,7 +9,8 @@ use crate::config::Config;
 use crate::io::csv_log::CsvOptions;
 use crate::io::csv_log::TableReading;
 use crate::io::log::LogOptions;
-use crate::replay::{LogReading, SLEEP_GAP_S};
+use crate::monitor::MonitorConfig;
+use crate::replay::{self, LogReading};
 
 /// Direction of positive current in a CSV.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
@@ -27,8 +28,9 @@ pub(crate) struct InputArgs {
     #[arg(long)]
     pub(crate) strict: bool,
     /// Count a gap longer than this as sleep of the recorder: during the gap, nothing is computed and no frame is made
-    #[arg(long, value_name = "SECONDS", default_value_t = SLEEP_GAP_S, value_parser = positive)]
-    pub(crate) sleep_gap: f64,
+    /// [default: four times the max_age_s of current and voltage, at least 30]
+    #[arg(long, value_name = "SECONDS", value_parser = positive)]
+    pub(crate) sleep_gap: Option<f64>,
     /// Read a channel or interface of a log as this interface, for example 2=can0. CHANNEL is written as in the log. By
     /// default, numbered channels are the configured interfaces in their order
     #[arg(long = "channel", value_name = "CHANNEL=INTERFACE", value_parser = channel)]
@@ -52,12 +54,19 @@ impl Default for InputArgs {
     fn default() -> Self {
         Self {
             strict: false,
-            sleep_gap: SLEEP_GAP_S,
+            sleep_gap: None,
             channels: Vec::new(),
             columns: Vec::new(),
             csv_sign: None,
             start_times: None,
         }
+    }
+}
+
+impl InputArgs {
+    /// Gap that counts as sleep of the recorder (s).
+    pub(crate) fn sleep_gap_s(&self, config: &MonitorConfig) -> f64 {
+        self.sleep_gap.unwrap_or_else(|| replay::sleep_gap_s(config))
     }
 }
 

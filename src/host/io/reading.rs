@@ -10,10 +10,17 @@ use crate::io::csv_log::CsvOptions;
 use crate::io::log::LogOptions;
 use crate::monitor::MonitorConfig;
 use crate::quantity::BusIndex;
-use crate::sample::VoltageSource;
+use crate::sample::{SHORT_GAP, VoltageSource};
 
-/// Default sleep gap (s). In a longer gap of a log, the recorder counts as asleep.
-pub const SLEEP_GAP_S: f64 = 30.0;
+/// Shortest default of the sleep gap (s).
+const LEAST_SLEEP_GAP_S: f64 = 30.0;
+
+/// Default sleep gap (s). In a longer gap of a log, the recorder counts as asleep. A recorder whose readings stay fresh
+/// over its own period is not asleep between two rows, nor while the sampler bridges a short gap.
+pub fn sleep_gap_s(config: &MonitorConfig) -> f64 {
+    let max_age_s = config.sample.current.max_age_s.max(config.sample.voltage.max_age_s);
+    LEAST_SLEEP_GAP_S.max(SHORT_GAP * max_age_s)
+}
 
 /// Settings for reading logs.
 #[derive(Debug, Clone, Default, PartialEq)]
