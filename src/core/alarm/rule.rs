@@ -51,7 +51,7 @@ pub enum Rule {
     /// A voltage channel does not show its own cell. The value is 1 in this case, else 0. While the value is 1, the
     /// rules that depend on the cell's voltage are unknown.
     ChannelFaulty = 17,
-    /// A cell's voltage collapses (1), a temperature of the cell rises without a current (2), or both (3); else 0.
+    /// A cell's voltage collapses (1), a temperature of the cell rises faster than the current explains (2), or both (3); else 0.
     ThermalEvent = 18,
 }
 
@@ -153,11 +153,15 @@ impl Rule {
         Self::ALL.into_iter().find(|rule| *rule as u8 == number)
     }
 
-    /// Formats a value of the rule with its unit. Fractions are shown as percentages.
+    /// Formats a value of the rule with its unit. Fractions are shown as percentages, the evidence of a thermal event in
+    /// words.
     pub fn with_unit(self, value: f64) -> String {
         let unit = self.spec().unit;
+        let evidence = EVIDENCE.iter().find(|(code, _)| self == Self::ThermalEvent && *code == value);
+        if let Some((_, words)) = evidence {
+            return (*words).to_owned();
+        }
         match unit {
-            Unit::Ratio if self == Self::ThermalEvent && value >= 1.0 => evidence_words(value).to_owned(),
             Unit::Fraction => format!("{:.1} %", 100.0 * value),
             Unit::FractionPerDay => format!("{:.3} %/d", 100.0 * value),
             Unit::Ratio => format!("{value:.2}"),
@@ -234,22 +238,19 @@ impl Rule {
                 (Cell, Above, Fraction, true, true, "a cell's contact resistance in excess of the other cells")
             }
             Self::ChannelFaulty => (Cell, Above, Fraction, false, false, "whether a voltage channel is faulty"),
-            Self::ThermalEvent => (Cell, Above, Ratio, false, true, "the evidence of a thermal event"),
+            Self::ThermalEvent => (Cell, Above, Ratio, false, false, "the evidence of a thermal event"),
         };
         RuleSpec { scope, direction, unit, has_deviation, is_learned, about }
     }
 }
 
-/// Words for the value of [`Rule::ThermalEvent`].
-fn evidence_words(value: f64) -> &'static str {
-    if value < 2.0 {
-        "its voltage collapses"
-    } else if value < 3.0 {
-        "its temperature rises without a current"
-    } else {
-        "its voltage collapses and its temperature rises"
-    }
-}
+/// Values of [`Rule::ThermalEvent`] in words.
+const EVIDENCE: [(f64, &str); 4] = [
+    (0.0, "no evidence now"),
+    (1.0, "its voltage collapses"),
+    (2.0, "its temperature rises faster than the current explains"),
+    (3.0, "its voltage collapses and its temperature rises"),
+];
 
 /// Severity; the values are the wire codes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]

@@ -3,15 +3,16 @@
 //! In: readings of cell voltages (V) and temperatures (degrees C) before the plausibility checks, because a thermal
 //! runaway changes them faster than plausible. Out: for each cell, whether there is evidence of a thermal event.
 //!
-//! * **Collapse**: the voltage has fallen by [`FALL`] within a minute, and by [`FALL`] more than the median of the other
-//!   cells. At least [`LEAST_READINGS`] different readings in [`LEAST_S`] show the fall. A cell that may be almost empty
-//!   is not judged, because its voltage can fall as fast. A broken sense wire raises the voltage of a neighbour, and a
-//!   dead channel repeats one value; neither counts.
+//! * **Collapse**: within a minute, the voltage has fallen by [`FALL`], and by [`FALL`] more than the median of the other
+//!   cells. At least [`LEAST_READINGS`] readings in [`LEAST_S`] show it. The drop that the current explains is deducted.
+//!   A cell that may be almost empty is not judged, because its voltage can fall as fast. A broken sense wire raises the
+//!   voltage of a neighbour, and a dead channel repeats one value; neither counts.
 //! * **Heating**: a temperature rises by [`RATE_C_PER_S`] for [`LEAST_S`], or by [`AHEAD_C`] more than the median of the
-//!   other sensors within [`WINDOW_S`]. The heat that the current can explain is deducted. A cell of the sensor is
-//!   named: the cell whose voltage has fallen most.
+//!   other sensors within [`WINDOW_S`]. The rise that the current explains is deducted. A second reading, [`LEAST_S`]
+//!   later, must confirm it. A cell of the sensor is named: the cell whose voltage has fallen most.
 //!
-//! The limits of voltage, rate and duration are those by which GB 38031 (appendix C) confirms a thermal runaway.
+//! The first minute after a break is not judged. The limits of voltage, rate and duration are those by which GB 38031
+//! (appendix C) confirms a thermal runaway.
 
 use std::collections::VecDeque;
 
@@ -26,16 +27,22 @@ const FALL: f64 = 0.25;
 const RATE_C_PER_S: f64 = 1.0;
 /// Shortest duration of a fall or rise (s; GB 38031, appendix C).
 const LEAST_S: f64 = 3.0;
-/// Least number of readings that show a fall, and of rises of a temperature. A single disturbance gives fewer.
+/// Least number of readings that show a fall, and of steps in which a temperature rises.
 const LEAST_READINGS: u32 = 3;
 /// Lead of a temperature over the median of the other sensors (degrees C).
 const AHEAD_C: f64 = 10.0;
-/// Longest time over which a rise is judged (s).
+/// Longest time over which a fall or rise is judged (s).
 const WINDOW_S: f64 = 120.0;
-/// Rise of a temperature sensor that a current of 1 C explains: the part of the first seconds (degrees C/s), the whole,
-/// and the part in which the sensors of a pack differ (degrees C). Cells and busbars heat with the square of the current.
+/// Drop that a current of 1 C explains (V): the drop of a good cell is a fifth of it.
+const EXPLAINED_V: f64 = 0.5;
+/// Highest voltage of a sound cell relative to the median of the other cells.
+const HIGHEST_SHARE: f64 = 1.1;
+/// Initial rate at which a sensor warms with a current of 1 C (degrees C/s). Cells and busbars heat with the square of
+/// the current.
 const EXPLAINED_C_PER_S: f64 = 0.1;
+/// Largest rise with a current of 1 C (degrees C).
 const EXPLAINED_C: f64 = 5.0;
+/// Largest difference between the rises of two sensors with a current of 1 C (degrees C).
 const EXPLAINED_DIFFERENCE_C: f64 = 1.0;
 /// Time over which the square of the current is averaged (s). A busbar cools in about a minute.
 const HEAT_S: f64 = 60.0;
@@ -43,11 +50,13 @@ const HEAT_S: f64 = 60.0;
 const UNKNOWN_RATE_PER_H: f64 = 1.0;
 /// Time between two references of a voltage, and between two refreshes of the values (s).
 const REFRESH_S: f64 = 30.0;
+/// A temperature is not judged for this long after its first reading (s), because the filter of its sensor settles.
+const SETTLE_S: f64 = 60.0;
 /// Evidence lasts this long after the last reading that shows it (s).
 const HOLD_S: f64 = 60.0;
 /// A cell whose SOC may be below this is not judged by its voltage.
 const ALMOST_EMPTY: f64 = 0.1;
-/// Shortest distance of the readings that a trail stores (s), and their number.
+/// Shortest distance between the readings of a trail (s), and their number.
 const FAST: (f64, usize) = (0.5, 8);
 const SLOW: (f64, usize) = (10.0, 13);
 
@@ -57,7 +66,11 @@ const SLOW: (f64, usize) = (10.0, 13);
 pub struct ThermalWatch {
     cells: Vec<CellState>,
     sensors: Vec<SensorState>,
+    /// Number of cells with a fall.
+    falling: usize,
     refreshed: Option<Timestamp>,
+    /// Currents at the last two refreshes (1/h, without sign).
+    rates_per_h: [f64; 2],
 }
 
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
@@ -90,10 +103,15 @@ struct Fall {
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct SensorState {
+    /// Time of the first reading after a break.
+    first: Option<Timestamp>,
+    latest: Option<Timestamp>,
     fast: Trail,
     slow: Trail,
     /// Mean square of the current (1/h^2).
     heat: f64,
+    /// A reading that showed a rise and has not been confirmed.
+    shown: Option<(Timestamp, f64)>,
 }
 
 /// Recent readings of a sensor.
@@ -107,7 +125,7 @@ impl Trail {
             self.0.pop_front();
         }
         if self.0.back().is_none_or(|(time, _)| now.since(*time) >= spacing_s) {
-            if self.0.len() == length {
+            while self.0.len() >= length {
                 self.0.pop_front();
             }
             self.0.push_back((now, value));
@@ -115,17 +133,20 @@ impl Trail {
     }
 
     /// Age (s) of each reading since which the temperature has only risen, in at least [`LEAST_READINGS`] steps up to
-    /// `value`, and the rise since then (degrees C). The largest step does not count, because it may be a disturbance.
+    /// `value`, and the rise above this reading and all readings before it (degrees C). The largest step does not count,
+    /// because it may be a disturbance.
     fn rises(&self, now: Timestamp, value: f64) -> impl Iterator<Item = (f64, f64)> + '_ {
         let (mut next, mut steps, mut largest) = (value, 0, 0.0_f64);
-        self.0
-            .iter()
-            .rev()
-            .map_while(move |&(time, earlier)| {
+        let readings = self.0.iter().enumerate().rev();
+        readings
+            .map_while(move |(index, &(time, earlier))| {
                 steps += u32::from(earlier < next);
                 largest = largest.max(next - earlier);
                 let has_fallen = std::mem::replace(&mut next, earlier) < earlier;
-                (!has_fallen).then(|| (steps >= LEAST_READINGS).then(|| (now.since(time), value - earlier - largest)))
+                (!has_fallen).then(|| {
+                    let highest = self.0.iter().take(index).fold(earlier, |highest, (_, before)| highest.max(*before));
+                    (steps >= LEAST_READINGS).then(|| (now.since(time), value - highest - largest))
+                })
             })
             .flatten()
     }
@@ -134,9 +155,13 @@ impl Trail {
     fn at(&self, time: Timestamp) -> Option<f64> {
         self.0.iter().find(|(at, _)| *at >= time).map(|(_, value)| *value)
     }
+
+    fn is_valid(&self, (_, length): (f64, usize)) -> bool {
+        self.0.len() <= length && self.0.iter().is_sorted_by(|a, b| a.0 <= b.0)
+    }
 }
 
-/// Heat that the current explains in a sensor.
+/// Rises that the current explains.
 #[derive(Debug, Clone, Copy)]
 struct Heat {
     /// Mean square of the current (1/h^2).
@@ -144,12 +169,12 @@ struct Heat {
 }
 
 impl Heat {
-    /// Rise that the current explains in a time (degrees C).
+    /// Rise of a sensor in a time (degrees C).
     fn explained_c(self, age_s: f64) -> f64 {
         self.square_per_h2 * (EXPLAINED_C_PER_S * age_s).min(EXPLAINED_C)
     }
 
-    /// Difference between the rises of two sensors that the current explains (degrees C).
+    /// Difference between the rises of two sensors (degrees C).
     fn explained_difference_c(self) -> f64 {
         self.square_per_h2 * EXPLAINED_DIFFERENCE_C
     }
@@ -159,9 +184,9 @@ impl ThermalWatch {
     /// Creates a watch without readings.
     pub fn new(cells: usize, sensors: usize) -> Self {
         let trail = |(_, length): (f64, usize)| Trail(VecDeque::with_capacity(length));
-        let sensor = || SensorState { fast: trail(FAST), slow: trail(SLOW), heat: 0.0 };
+        let sensor = || SensorState { fast: trail(FAST), slow: trail(SLOW), ..SensorState::default() };
         let sensors = (0..sensors).map(|_| sensor()).collect();
-        Self { cells: vec![CellState::default(); cells], sensors, refreshed: None }
+        Self { cells: vec![CellState::default(); cells], sensors, ..Self::default() }
     }
 
     /// Forgets the readings, because no reading follows for a while. Evidence ends.
@@ -183,54 +208,73 @@ impl ThermalWatch {
             self.cells.iter().flat_map(|cell| cell.references_v.into_iter().chain([cell.latest_v])).flatten();
         let trails = self.sensors.iter().flat_map(|sensor| sensor.fast.0.iter().chain(&sensor.slow.0));
         let temperatures = trails.map(|(_, value)| *value).chain(self.sensors.iter().map(|sensor| sensor.heat));
-        InvalidState::unless_numbers("a reading of the thermal watch", voltages.chain(temperatures))
+        let readings = voltages.chain(temperatures).chain(self.rates_per_h);
+        InvalidState::unless_numbers("a reading of the thermal watch", readings)?;
+        let falling = self.cells.iter().filter(|cell| cell.fall.is_some()).count();
+        let has_trails = self.sensors.iter().all(|it| it.fast.is_valid(FAST) && it.slow.is_valid(SLOW));
+        let is_whole = has_trails && falling == self.falling;
+        InvalidState::unless(is_whole, "the number of falling cells", self.falling as f64, "as many as the cells show")
     }
 
-    /// Handles a reading of a cell's voltage (V). Returns whether the evidence for this cell has changed.
+    /// Handles a reading of a cell's voltage (V). `rate_per_h`: current relative to the rated capacity; `None` = unknown.
+    /// Returns whether the evidence for this cell is new.
     #[inline]
-    pub fn handle_voltage(&mut self, now: Timestamp, cell: CellIndex, voltage_v: f64) -> bool {
+    pub fn handle_voltage(
+        &mut self,
+        now: Timestamp,
+        cell: CellIndex,
+        voltage_v: f64,
+        rate_per_h: impl FnOnce() -> Option<f64>,
+    ) -> bool {
         let Some(state) = self.cells.get_mut(cell.index()).filter(|_| voltage_v.is_finite()) else { return false };
         (state.latest_v, state.is_fresh) = (Some(voltage_v), true);
         if state.share_left().is_none_or(|share| share >= 1.0 - FALL) {
-            state.fall = None;
+            self.falling -= usize::from(state.fall.take().is_some());
             return false;
         }
-        self.handle_fallen(now, cell.index(), voltage_v)
+        self.handle_fallen(now, cell.index(), voltage_v, rate_per_h())
     }
 
     /// Handles a voltage that is far below its reference.
     #[cold]
-    fn handle_fallen(&mut self, now: Timestamp, cell: usize, voltage_v: f64) -> bool {
-        let first = Fall { since: now, first_v: voltage_v, readings: 0, has_moved: false };
+    fn handle_fallen(&mut self, now: Timestamp, cell: usize, voltage_v: f64, rate_per_h: Option<f64>) -> bool {
         let state = &mut self.cells[cell];
-        let fall = state.fall.get_or_insert(first);
+        self.falling += usize::from(state.fall.is_none());
+        let fall = state.fall.get_or_insert(Fall { since: now, first_v: voltage_v, readings: 0, has_moved: false });
         fall.readings = fall.readings.saturating_add(1);
         fall.has_moved |= voltage_v != fall.first_v;
         let is_shown = now.since(fall.since) >= LEAST_S && fall.readings >= LEAST_READINGS && fall.has_moved;
-        if !is_shown || state.may_be_empty || !self.is_alone(cell) {
+        let was_known = is_current(state.collapsed_until, now);
+        if !is_shown || state.may_be_empty || 2 * self.falling > self.cells.len() {
             return false;
         }
-        let state = &mut self.cells[cell];
-        let is_new = !is_current(state.collapsed_until, now);
-        state.collapsed_until = Some(now.plus_secs(HOLD_S));
-        is_new
-    }
-
-    /// Whether the voltage of a cell has fallen much more than the voltages of the others, without a rise of a
-    /// neighbour's voltage.
-    fn is_alone(&self, cell: usize) -> bool {
-        let others = self.cells.iter().enumerate().filter(|(index, _)| *index != cell);
-        let shares: Vec<f64> = others.filter_map(|(_, other)| other.share_left()).collect();
-        let (Some(own), Some(middle)) = (self.cells[cell].share_left(), median(shares.iter().copied())) else {
+        if !was_known && !self.is_alone(cell, rate_per_h) {
             return false;
-        };
-        let neighbours = [cell.checked_sub(1), Some(cell + 1)].into_iter().flatten();
-        let rise = neighbours.filter_map(|index| self.cells.get(index)?.rise()).fold(0.0, f64::max);
-        shares.len() > 1 && middle - own >= FALL && rise < 0.5 * (1.0 - own)
+        }
+        self.cells[cell].collapsed_until = Some(now.plus_secs(HOLD_S));
+        !was_known
     }
 
-    /// Handles a reading of a temperature sensor (degrees C). `rate_per_h`: current relative to
-    /// the rated capacity; `None` = unknown. `measures`: whether the sensor measures a cell. Returns the cell if its evidence has changed.
+    /// Whether the voltage of a cell has fallen more than the current and the other cells explain, without a rise of a
+    /// neighbour's voltage.
+    fn is_alone(&self, cell: usize, rate_per_h: Option<f64>) -> bool {
+        let others = || self.cells.iter().enumerate().filter(|(index, _)| *index != cell).map(|(_, other)| other);
+        let shares: Vec<f64> = others().filter_map(CellState::share_left).collect();
+        let middle_v = median(others().filter_map(CellState::reference_v));
+        let own = &self.cells[cell];
+        let (Some(middle), Some(middle_v)) = (median(shares.iter().copied()), middle_v) else { return false };
+        let (Some(latest_v), Some(reference_v)) = (own.latest_v, own.reference_v()) else { return false };
+        let rate_per_h = rate_per_h.unwrap_or(UNKNOWN_RATE_PER_H).abs() + self.rates_per_h[0].max(self.rates_per_h[1]);
+        // A higher reference was no voltage of the cell.
+        let reference_v = reference_v.min(HIGHEST_SHARE * middle_v);
+        let share = (latest_v + EXPLAINED_V * rate_per_h) / reference_v;
+        let neighbours = [cell.checked_sub(1), Some(cell + 1)].into_iter().flatten();
+        let rise = neighbours.filter_map(|index| self.cells.get(index)?.share_left()).fold(1.0, f64::max) - 1.0;
+        shares.len() > 1 && share <= middle.min(1.0) - FALL && rise < 0.5 * (1.0 - latest_v / reference_v)
+    }
+
+    /// Handles a reading of a temperature sensor (degrees C). `rate_per_h`: current relative to the rated capacity; `None`
+    /// = unknown. `measures`: whether the sensor measures a cell. Returns the cell if its evidence is new.
     pub fn handle_temperature(
         &mut self,
         now: Timestamp,
@@ -241,14 +285,19 @@ impl ThermalWatch {
     ) -> Option<CellIndex> {
         let state = self.sensors.get_mut(sensor.index()).filter(|_| temperature_c.is_finite())?;
         let present = square(rate_per_h.unwrap_or(UNKNOWN_RATE_PER_H));
-        let elapsed_s = state.fast.0.back().map_or(0.0, |(time, _)| now.since(*time)).max(0.0);
-        state.heat += (present - state.heat) * (1.0 - libm::exp(-elapsed_s / HEAT_S));
+        let elapsed_s = state.latest.replace(now).map_or(0.0, |latest| now.since(latest)).max(0.0);
+        state.heat += (present - state.heat) * -libm::expm1(-elapsed_s / HEAT_S);
         let heat = Heat { square_per_h2: state.heat.max(present) };
+        if !(SETTLE_S..).contains(&now.since(*state.first.get_or_insert(now))) {
+            return None;
+        }
         let is_rising = self.is_rising(now, sensor.index(), temperature_c, heat);
         let state = &mut self.sensors[sensor.index()];
         state.fast.add(now, temperature_c, FAST);
         state.slow.add(now, temperature_c, SLOW);
-        if !is_rising {
+        let is_still = |(time, value): (Timestamp, f64)| temperature_c >= value && now.since(time) <= WINDOW_S;
+        state.shown = state.shown.filter(|shown| is_still(*shown));
+        if !is_rising || now.since(state.shown.get_or_insert((now, temperature_c)).0) < LEAST_S {
             return None;
         }
         let of_sensor = || (0..self.cells.len()).filter(|&cell| measures(cell));
@@ -283,48 +332,73 @@ impl ThermalWatch {
         median(rises.iter().copied()).filter(|_| rises.len() > 1).map(|rise| rise.max(0.0))
     }
 
-    /// Takes new references if they are due. `least_soc`: lower bound of a cell's SOC; `None` = unknown. Returns whether
-    /// the values of all cells are to be published.
-    pub fn refresh(&mut self, now: Timestamp, least_soc: impl Fn(usize) -> Option<f64>) -> bool {
+    /// Takes new references if they are due. `rate_per_h`: current relative to the rated capacity; `None` = unknown.
+    /// `least_soc`: lower bound of a cell's SOC; `None` = unknown. Returns whether new values are to be published.
+    pub fn refresh(
+        &mut self,
+        now: Timestamp,
+        rate_per_h: Option<f64>,
+        least_soc: impl Fn(usize) -> Option<f64>,
+    ) -> bool {
         let elapsed_s = self.refreshed.map_or(f64::INFINITY, |at| now.since(at));
         if (0.0..REFRESH_S).contains(&elapsed_s) {
             return false;
         }
         for (index, cell) in self.cells.iter_mut().enumerate() {
+            // A fallen voltage is no reference as long as the fall is judged.
+            if cell.fall.is_some_and(|fall| (0.0..WINDOW_S).contains(&now.since(fall.since))) {
+                continue;
+            }
+            self.falling -= usize::from(cell.fall.take().is_some());
             let is_fresh = std::mem::take(&mut cell.is_fresh);
             cell.references_v = [cell.references_v[1], cell.latest_v.filter(|_| is_fresh)];
             cell.may_be_empty = least_soc(index).is_none_or(|soc| soc < ALMOST_EMPTY);
         }
+        self.rates_per_h = [self.rates_per_h[1], rate_per_h.unwrap_or(UNKNOWN_RATE_PER_H).abs()];
         self.refreshed = Some(now);
         true
     }
 
-    /// Evidence for a cell: 0 = none, 1 = its voltage has collapsed, 2 = its temperature rises, 3 = both; `None` = neither
-    /// the voltage nor a temperature was measured. `sensor`: the cell's temperature sensor.
-    pub fn evidence(&self, now: Timestamp, cell: CellIndex, sensor: Option<SensorIndex>) -> Option<f64> {
-        let state = self.cells.get(cell.index())?;
-        let collapsed = if is_current(state.collapsed_until, now) { 1.0 } else { 0.0 };
-        let heating = if is_current(state.heating_until, now) { 2.0 } else { 0.0 };
-        let sensor = sensor.and_then(|sensor| self.sensors.get(sensor.index()));
-        let is_measured = state.references_v.iter().any(Option::is_some)
-            || sensor.is_some_and(|sensor| sensor.slow.0.back().is_some_and(|(time, _)| now.since(*time) <= WINDOW_S));
-        (is_measured || collapsed + heating > 0.0).then_some(collapsed + heating)
+    /// Evidence for each cell: 0 = none, 1 = its voltage has collapsed, 2 = its temperature rises, 3 = both; `None` =
+    /// neither its voltage nor a temperature can be judged. `sensors`: the temperature sensor of each cell.
+    pub fn evidence(
+        &self,
+        now: Timestamp,
+        sensors: &[Option<SensorIndex>],
+    ) -> impl Iterator<Item = (CellIndex, Option<f64>)> {
+        let compared = self.cells.iter().filter(|cell| cell.reference_v().is_some()).count();
+        (0..).map(CellIndex).zip(self.cells.iter().zip(sensors)).map(move |(cell, (state, sensor))| {
+            let value = state.evidence(now);
+            let is_compared = compared > 2 && state.reference_v().is_some() && !state.may_be_empty;
+            let sensor = sensor.and_then(|sensor| self.sensors.get(sensor.index()));
+            let is_watched =
+                || sensor.is_some_and(|it| it.slow.0.back().is_some_and(|(at, _)| now.since(*at) <= WINDOW_S));
+            (cell, (value > 0.0 || is_compared || is_watched()).then_some(value))
+        })
+    }
+
+    /// Evidence for a cell, as in [`Self::evidence`].
+    pub fn evidence_of(&self, now: Timestamp, cell: CellIndex) -> f64 {
+        self.cells.get(cell.index()).map_or(0.0, |state| state.evidence(now))
     }
 }
 
 impl CellState {
-    /// The latest voltage relative to the highest reference.
-    fn share_left(&self) -> Option<f64> {
-        let reference_v =
-            self.references_v.into_iter().flatten().reduce(f64::max).filter(|voltage_v| *voltage_v > 0.0)?;
-        Some(self.latest_v? / reference_v)
+    /// The lower of the last two references, so that one disturbed reading counts for nothing; `None` in the first minute.
+    fn reference_v(&self) -> Option<f64> {
+        let [before_v, last_v] = self.references_v;
+        Some(before_v?.min(last_v?)).filter(|voltage_v| *voltage_v > 0.0)
     }
 
-    /// Rise of the latest voltage above the lowest reference, relative to it.
-    fn rise(&self) -> Option<f64> {
-        let reference_v =
-            self.references_v.into_iter().flatten().reduce(f64::min).filter(|voltage_v| *voltage_v > 0.0)?;
-        Some(self.latest_v? / reference_v - 1.0)
+    /// The latest voltage relative to the reference.
+    fn share_left(&self) -> Option<f64> {
+        Some(self.latest_v? / self.reference_v()?)
+    }
+
+    fn evidence(&self, now: Timestamp) -> f64 {
+        let collapsed = if is_current(self.collapsed_until, now) { 1.0 } else { 0.0 };
+        let heating = if is_current(self.heating_until, now) { 2.0 } else { 0.0 };
+        collapsed + heating
     }
 }
 

@@ -43,7 +43,7 @@ fn catalogue(has_report: bool) -> Value {
     };
     let rules = Rule::ALL.into_iter().filter(|rule| *rule != Rule::ThermalEvent);
     let rules = rules.map(|rule| (rule.name().to_owned(), json!(rule.with_unit(1.0))));
-    let thermal_event = [1.0, 2.0, 3.0].map(|value| Rule::ThermalEvent.with_unit(value));
+    let thermal_event = [0.0, 1.0, 2.0, 3.0].map(|value| Rule::ThermalEvent.with_unit(value));
     let findings = CellFaultKind::ALL.map(|kind| {
         let size = ScalarGaussian { mean: 1.0, variance: 1.0 };
         let (since, reported) = (Timestamp::ZERO, Timestamp::ZERO);

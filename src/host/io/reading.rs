@@ -15,8 +15,8 @@ use crate::sample::{SHORT_GAP, VoltageSource};
 /// Shortest default of the sleep gap (s).
 const LEAST_SLEEP_GAP_S: f64 = 30.0;
 
-/// Default sleep gap (s). In a longer gap of a log, the recorder counts as asleep. A recorder whose readings stay fresh
-/// over its own period is not asleep between two rows, nor while the sampler bridges a short gap.
+/// Default sleep gap (s). In a longer gap of a log, the recorder counts as asleep. The sampler bridges gaps of up to
+/// [`SHORT_GAP`] times the maximum age, so the recorder does not count as asleep in such a gap.
 pub fn sleep_gap_s(config: &MonitorConfig) -> f64 {
     let max_age_s = config.sample.current.max_age_s.max(config.sample.voltage.max_age_s);
     LEAST_SLEEP_GAP_S.max(SHORT_GAP * max_age_s)

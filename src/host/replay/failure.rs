@@ -84,7 +84,7 @@ fn mostly_asleep(span: &RecordSpan) -> Option<String> {
         format!(
             "mostly asleep: {gaps} of {steps} steps between stamps are longer than the sleep gap, so nothing is \
              computed there; if the recorder was awake, set max_age_s in [limits.current] and [limits.voltage] to its \
-             longest step"
+             longest step, or give a longer --sleep-gap"
         )
     })
 }

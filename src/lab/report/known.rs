@@ -1,6 +1,6 @@
 //! Lists what is known about the battery, as named figures, and what is not known: why, and what would teach it.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 use super::context::PageContext;
 use super::data::{Data, Origin};
@@ -56,6 +56,11 @@ impl Knowledge {
         known.resistance(data, context);
         known.recharge(data, context);
         match outlook {
+            Ok(outlook) if outlook.is_vague() => known.gap(
+                "Remaining life",
+                format!("Too uncertain: {}.", outlook.note(data.cells())),
+                "Measured capacities over months of use.",
+            ),
             Ok(outlook) => known.tile("Remaining life", outlook.value(), outlook.note(data.cells())),
             Err(why) => known.gap("Remaining life", capitalised(why) + ".", "Measured capacities over months of use."),
         }
@@ -68,8 +73,7 @@ impl Knowledge {
         if let Some(cycles) = series::full_cycles(data, rated_ah) {
             known.tile("Use so far", format!("{cycles:.0} cycles"), "equivalent full cycles in this record");
         }
-        let in_all = data.alarms.iter().filter(|row| row.change == "raised").count();
-        known.tile("Alarms raised now", raised.len().to_string(), format!("{in_all} raised in this record"));
+        known.tile("Alarms raised now", raised.len().to_string(), raised_before(data));
         known.model(data, context);
         known
     }
@@ -98,7 +102,7 @@ impl Knowledge {
         match context.rated_ah(step.cell) {
             Some(rated) => self.tile(
                 "State of health",
-                format!("{:.0} %", 100.0 * step.worst.0 / rated),
+                format!("{:.0} \u{b1} {:.0} %", 100.0 * step.worst.0 / rated, 100.0 * step.worst.1 / rated),
                 format!("of {rated} Ah rated{}{}", of_cell(data, &step), assumed(measured, &step)),
             ),
             None => self.gap(
@@ -260,6 +264,17 @@ fn teaches_by_label(context: &PageContext<'_>) -> String {
     let lfp = " An LFP cell must be nearly empty at one end and nearly full at the other.";
     let is_flat = !is_learnable(context);
     format!("A discharge and a charge of more than a quarter of the capacity.{}", if is_flat { lfp } else { "" })
+}
+
+/// Says which alarms were raised in the record, and how often. Alarms of several cells at the same time count once.
+fn raised_before(data: &Data) -> String {
+    let mut times: BTreeMap<&str, BTreeSet<u64>> = BTreeMap::new();
+    for row in data.alarms.iter().filter(|row| row.change == "raised") {
+        times.entry(&row.rule).or_default().insert(row.time_s.to_bits());
+    }
+    let often = times.iter().map(|(rule, times)| format!("{rule} {} \u{d7}", times.len()));
+    let often: Vec<String> = often.collect();
+    if often.is_empty() { "none in this record".to_owned() } else { format!("in this record: {}", often.join(", ")) }
 }
 
 fn last(data: &Data, pick: series::ValueSelector, high_is_bad: bool) -> Option<CellStep> {

@@ -15,7 +15,7 @@ use super::series;
 use super::summary::Condition;
 use crate::alarm::{Direction, Rule};
 use crate::cell_faults::{CellFault, CellFaultKind, Imbalance};
-use crate::quantity::CellIndex;
+use crate::quantity::{CellIndex, DAY_S};
 
 /// From this loss on, the pack counts as out of balance, fraction of its charge. Two standard deviations below the
 /// estimated loss must reach it.
@@ -23,7 +23,7 @@ const OUT_OF_BALANCE: f64 = 0.03;
 /// A contact that is found within this part of the record counts as high from the beginning. Finding it takes days.
 const BEGINNING: f64 = 0.25;
 /// Time after which a contact that has not grown counts as steady (s).
-const STEADY_S: f64 = 7.0 * 86_400.0;
+const STEADY_S: f64 = 7.0 * DAY_S;
 
 /// Kinds of findings about cells, in the order of the page. Other kinds follow; they are about sensors.
 const CELL_KINDS: [CellFaultKind; 8] = [
@@ -67,8 +67,8 @@ pub(super) fn problems(data: &Data, context: &PageContext<'_>, outlook: Option<&
         advice: "Do not rely on them.".to_owned(),
         note: String::new(),
     }));
-    // A stable sort: problems of the same condition keep their order.
-    problems.sort_by_key(|problem| std::cmp::Reverse(problem.condition));
+    // A stable sort: problems of the same condition keep their order, those with a raised alarm first.
+    problems.sort_by_key(|problem| std::cmp::Reverse((problem.condition, problem.note.contains("Alarm "))));
     problems
 }
 
@@ -89,7 +89,7 @@ fn of_battery(
     let mut of_charge = groups.iter().position(|group| is_charge(group[0].kind));
     if let Some((pack, at)) = imbalance.zip(of_charge) {
         let (mean, std) = percent(pack);
-        problems[at].what += &format!(" The pack loses {mean:.1} \u{b1} {std:.1} % of its charge by imbalance.");
+        problems[at].what += &format!(" Because of imbalance, {mean:.1} \u{b1} {std:.1} % of the pack's capacity cannot be used.");
     } else if let Some(pack) = imbalance.filter(|pack| is_unbalanced(pack)) {
         of_charge = Some(problems.len());
         problems.push(unbalanced(pack, findings.is_empty()));
@@ -104,7 +104,7 @@ fn of_battery(
         Some(rule) => findings.iter().any(|found| explains(found, rule, alarm.row.cell)),
         None => false,
     };
-    let no_limit = if raised.is_empty() { ", but no limit is exceeded" } else { "" };
+    let no_limit = if raised.is_empty() { ", but no alarm is raised" } else { "" };
     let is_capacity_low = raised.iter().any(|alarm| rule(&alarm.row.rule) == Some(Rule::CapacityLow));
     let open: Vec<ActiveAlarm<'_>> = raised.into_iter().filter(|alarm| !is_explained(alarm)).collect();
     problems.extend(grouped(&open).iter().map(|group| alarm(group, data, context, outlook)));
@@ -186,12 +186,13 @@ fn finding(group: &[&CellFault], raised: &[ActiveAlarm<'_>], data: &Data) -> Pro
     }
 }
 
-/// One sentence per rule and severity: since when which alarm is raised.
+/// One sentence per rule, severity and date: since when which alarm is raised.
 fn alarm_notes(alarms: &[&ActiveAlarm<'_>], data: &Data) -> String {
+    let day = |since_s: f64| (since_s / DAY_S).floor();
     let mut notes: Vec<((&str, &str), f64, Vec<usize>)> = Vec::new();
     for alarm in alarms {
         let key = (alarm.row.rule.as_str(), alarm.row.severity.as_str());
-        match notes.iter_mut().find(|note| note.0 == key) {
+        match notes.iter_mut().find(|note| note.0 == key && day(note.1) == day(alarm.since_s)) {
             Some((_, since_s, numbers)) => {
                 *since_s = since_s.min(alarm.since_s);
                 numbers.extend(alarm.row.cell);
@@ -329,16 +330,16 @@ fn is_unbalanced(pack: &Imbalance) -> bool {
 fn unbalanced(pack: &Imbalance, is_only: bool) -> Problem {
     let (mean, std) = percent(pack);
     let [empty, full] = [&pack.discharge_limit, &pack.charge_limit].map(|limit| limit.cell.index() + 1);
-    let no_other = if is_only { " No single cell is failing." } else { "" };
+    let no_other = if is_only { " No failing cell was found." } else { "" };
     Problem {
         condition: Condition::Plan,
         what: format!(
-            "The pack is out of balance: it loses {mean:.1} \u{b1} {std:.1} % of its charge. Cell {empty} is empty first, \
+            "The pack is out of balance: {mean:.1} \u{b1} {std:.1} % of its capacity cannot be used. Cell {empty} is empty first, \
              and cell {full} is full first.{no_other}"
         ),
         advice:
-            "Balance the pack: this restores the lost charge. Then create the report again: a cell that drifts away \
-                 again is failing."
+            "Balance the pack: this restores the lost capacity. Then create the report again: if a cell drifts away \
+                 again, it is failing."
                 .to_owned(),
         note: String::new(),
     }
@@ -370,7 +371,7 @@ fn alarm_sentence(group: &AlarmGroup<'_>, data: &Data, context: &PageContext<'_>
         Rule::InputMissing => return format!("Readings of {whose} are missing."),
         Rule::InputImplausible => return format!("Readings of {whose} are implausible."),
         Rule::ChannelFaulty => return format!("The voltage channel of {whose} does not show its cell."),
-        Rule::ThermalEvent => return format!("A thermal event has begun at {whose}: {}.", said(group.alarms[0])),
+        Rule::ThermalEvent => return format!("A thermal event has begun at {whose}: {}.", evidence(group)),
         _ => {}
     }
     let spec = rule.spec();
@@ -399,9 +400,11 @@ fn alarm_sentence(group: &AlarmGroup<'_>, data: &Data, context: &PageContext<'_>
     }
 }
 
-/// The value with which an alarm was raised, in words.
-fn said(alarm: &ActiveAlarm<'_>) -> String {
-    alarm.row.value.map_or_else(|| "unknown".to_owned(), |value| Rule::ThermalEvent.with_unit(value))
+/// The evidence with which alarms of a thermal event were raised, in words.
+fn evidence(group: &AlarmGroup<'_>) -> String {
+    let values: Vec<f64> = group.alarms.iter().filter_map(|alarm| alarm.row.value).collect();
+    let has = |kind: u8| values.iter().any(|value| *value as u8 & kind != 0);
+    Rule::ThermalEvent.with_unit(f64::from(u8::from(has(1)) + 2 * u8::from(has(2))))
 }
 
 fn condition_of(severity: &str) -> Condition {

@@ -84,35 +84,38 @@ impl Findings {
         &mut self,
         now: Timestamp,
         reading: &Reading,
-        (sampling, rated_ah): (&Sampling, f64),
-    ) -> Option<(CellIndex, Option<f64>)> {
+        (sampling, estimation): (&Sampling, &Estimation),
+    ) -> Option<(CellIndex, f64)> {
         let (thermal, value) = (self.thermal.as_mut()?, reading.value.ok()?);
-        let config = sampling.sampler.config();
         let cell = match reading.channel {
-            Channel::CellVoltage(cell) => Some(cell).filter(|_| thermal.handle_voltage(now, cell, value)),
+            Channel::CellVoltage(cell) => {
+                let rate_per_h = || rate_per_h(now, cell.index(), sampling, estimation);
+                thermal.handle_voltage(now, cell, value, rate_per_h).then_some(cell)
+            }
             Channel::Temperature(sensor) => {
-                let rate_per_h = sampling.sampler.cell_current_a(now).map(|current_a| current_a / rated_ah);
-                let measures = |cell: usize| config.sensor_of_cell.get(cell) == Some(&Some(sensor));
+                let sensors = &sampling.sampler.config().sensor_of_cell;
+                let measures = |cell: usize| sensors.get(cell) == Some(&Some(sensor));
+                let first = (0..sensors.len()).find(|&cell| measures(cell))?;
+                let rate_per_h = rate_per_h(now, first, sampling, estimation);
                 thermal.handle_temperature(now, sensor, value, rate_per_h, measures)
             }
             _ => None,
         }?;
-        Some((cell, thermal.evidence(now, cell, config.sensor_of_cell.get(cell.index()).copied().flatten())))
+        Some((cell, thermal.evidence_of(now, cell)))
     }
 
     /// Refreshes the watch for a thermal event if this is due. If so, returns the evidence for each cell.
     pub(crate) fn refresh_thermal(
         &mut self,
         now: Timestamp,
-        estimation: &Estimation,
-        sampling: &Sampling,
-    ) -> Option<Vec<Option<f64>>> {
-        let thermal = self.thermal.as_mut()?;
+        (sampling, estimation): (&Sampling, &Estimation),
+    ) -> Vec<(CellIndex, Option<f64>)> {
+        let Some(thermal) = &mut self.thermal else { return Vec::new() };
         let least_soc = |cell: usize| estimation.bank.soc(cell).map(|soc| soc.mean - 2.0 * soc.std());
-        let sensors = &sampling.sampler.config().sensor_of_cell;
-        let is_due = thermal.refresh(now, least_soc);
-        let evidence = |(cell, sensor): (u16, &Option<_>)| thermal.evidence(now, CellIndex(cell), *sensor);
-        is_due.then(|| (0..).zip(sensors).map(evidence).collect())
+        if !thermal.refresh(now, rate_per_h(now, 0, sampling, estimation), least_soc) {
+            return Vec::new();
+        }
+        thermal.evidence(now, &sampling.sampler.config().sensor_of_cell).collect()
     }
 
     /// The state to be stored; `None` if the pack is too small for a comparison.
@@ -209,7 +212,12 @@ impl Findings {
     }
 }
 
-/// The watch that the configured rules demand.
+/// Current of a cell relative to its rated capacity (1/h); `None` = unknown.
+fn rate_per_h(now: Timestamp, cell: usize, sampling: &Sampling, estimation: &Estimation) -> Option<f64> {
+    Some(sampling.sampler.cell_current_a(now)? / estimation.bank.model(cell).rated_capacity_ah)
+}
+
+/// Creates the watch if the rule `thermal_event` is configured.
 fn thermal_watch(config: &MonitorConfig) -> Option<ThermalWatch> {
     let is_wanted = config.rules.iter().any(|rule| rule.rule == Rule::ThermalEvent);
     let sensors = config.sample.sensor_of_cell.iter().flatten().map(|sensor| sensor.index() + 1).max().unwrap_or(0);

@@ -67,16 +67,14 @@ impl Stages {
     /// Watches a reading for a thermal event, and passes new evidence to its rule at once.
     #[inline]
     pub(crate) fn watch_reading(&mut self, now: Timestamp, reading: &Reading, out: &mut Outputs) {
-        let rated_ah = self.estimation.bank.own_model().rated_capacity_ah;
-        if let Some((cell, evidence)) = self.findings.watch_reading(now, reading, (&self.sampling, rated_ah)) {
-            self.publisher(now, out).observe(Rule::ThermalEvent, Some(cell), Observation::new(evidence));
+        if let Some((cell, evidence)) = self.findings.watch_reading(now, reading, (&self.sampling, &self.estimation)) {
+            self.publisher(now, out).observe(Rule::ThermalEvent, Some(cell), Observation::new(Some(evidence)));
         }
     }
 
     /// Passes the evidence of a thermal event of every cell to its rule, every half minute.
     fn refresh_thermal(&mut self, now: Timestamp, out: &mut Outputs) {
-        let evidence = self.findings.refresh_thermal(now, &self.estimation, &self.sampling);
-        for (cell, evidence) in (0..).map(CellIndex).zip(evidence.into_iter().flatten()) {
+        for (cell, evidence) in self.findings.refresh_thermal(now, (&self.sampling, &self.estimation)) {
             self.publisher(now, out).observe(Rule::ThermalEvent, Some(cell), Observation::new(evidence));
         }
     }

@@ -145,6 +145,9 @@ fn check_needs(alarm: &Alarm, raw: &RawTables) {
         Rule::CellLeak | Rule::ConnectionResistance | Rule::ChannelFaulty if cells < 3 => {
             "requires the voltages of at least three cells"
         }
+        Rule::ThermalEvent if cells < 3 && raw.temperatures.is_empty() && !raw.broken => {
+            "requires the voltages of at least three cells or an [[input.temperature]]"
+        }
         Rule::BmsDisagrees if !is_reported => "requires [input.reported_soc] or [input.reported_soh]",
         _ => "",
     };
