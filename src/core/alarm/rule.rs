@@ -157,9 +157,9 @@ impl Rule {
     /// words.
     pub fn with_unit(self, value: f64) -> String {
         let unit = self.spec().unit;
-        let evidence = EVIDENCE.iter().find(|(code, _)| self == Self::ThermalEvent && *code == value);
+        let evidence = (0_u8..).zip(EVIDENCE).find(|(code, _)| self == Self::ThermalEvent && f64::from(*code) == value);
         if let Some((_, words)) = evidence {
-            return (*words).to_owned();
+            return words.to_owned();
         }
         match unit {
             Unit::Fraction => format!("{:.1} %", 100.0 * value),
@@ -245,11 +245,11 @@ impl Rule {
 }
 
 /// Values of [`Rule::ThermalEvent`] in words.
-const EVIDENCE: [(f64, &str); 4] = [
-    (0.0, "no evidence now"),
-    (1.0, "its voltage collapses"),
-    (2.0, "its temperature rises faster than the current explains"),
-    (3.0, "its voltage collapses and its temperature rises"),
+const EVIDENCE: [&str; 4] = [
+    "no evidence now",
+    "its voltage collapses",
+    "its temperature rises faster than the current explains",
+    "its voltage collapses and its temperature rises",
 ];
 
 /// Severity; the values are the wire codes.

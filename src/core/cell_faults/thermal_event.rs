@@ -133,22 +133,22 @@ impl Trail {
     }
 
     /// Age (s) of each reading since which the temperature has only risen, in at least [`LEAST_READINGS`] steps up to
-    /// `value`, and the rise above this reading and all readings before it (degrees C). The largest step does not count,
-    /// because it may be a disturbance.
+    /// `value`, and the rise since then (degrees C). The largest step does not count, because it may be a disturbance.
     fn rises(&self, now: Timestamp, value: f64) -> impl Iterator<Item = (f64, f64)> + '_ {
         let (mut next, mut steps, mut largest) = (value, 0, 0.0_f64);
-        let readings = self.0.iter().enumerate().rev();
-        readings
-            .map_while(move |(index, &(time, earlier))| {
-                steps += u32::from(earlier < next);
-                largest = largest.max(next - earlier);
-                let has_fallen = std::mem::replace(&mut next, earlier) < earlier;
-                (!has_fallen).then(|| {
-                    let highest = self.0.iter().take(index).fold(earlier, |highest, (_, before)| highest.max(*before));
-                    (steps >= LEAST_READINGS).then(|| (now.since(time), value - highest - largest))
-                })
-            })
-            .flatten()
+        let rises = self.0.iter().rev().map_while(move |&(time, earlier)| {
+            steps += u32::from(earlier < next);
+            largest = largest.max(next - earlier);
+            let has_fallen = std::mem::replace(&mut next, earlier) < earlier;
+            (!has_fallen).then(|| (steps >= LEAST_READINGS).then(|| (now.since(time), value - earlier - largest)))
+        });
+        rises.flatten()
+    }
+
+    /// Highest reading up to `time`.
+    fn highest_until(&self, time: Timestamp) -> f64 {
+        let before = self.0.iter().take_while(|(at, _)| *at <= time);
+        before.fold(f64::NEG_INFINITY, |highest, (_, value)| highest.max(*value))
     }
 
     /// The reading at `time`, or the next reading after it.
@@ -308,16 +308,31 @@ impl ThermalWatch {
         named.is_none().then(|| CellIndex(u16::try_from(cell).unwrap_or(u16::MAX)))
     }
 
-    /// Whether a temperature rises faster than the current and the other sensors explain.
+    /// Whether a temperature rises faster than the current and the other sensors explain, to more than it and the other
+    /// sensors showed before.
     fn is_rising(&self, now: Timestamp, sensor: usize, temperature_c: f64, heat: Heat) -> bool {
         let state = &self.sensors[sensor];
+        let rise_above = |(age_s, rise_c): (f64, f64)| {
+            let highest_c = state.slow.highest_until(now.plus_secs(-age_s));
+            (age_s, rise_c.min(temperature_c - highest_c))
+        };
         let is_fast =
             |(age_s, rise_c): (f64, f64)| age_s >= LEAST_S && rise_c - heat.explained_c(age_s) >= RATE_C_PER_S * age_s;
         let is_ahead = |(age_s, rise_c): (f64, f64)| {
             let least_c = AHEAD_C + heat.explained_difference_c();
             rise_c >= least_c && self.rise_of_others(now, sensor, age_s).is_some_and(|rise| rise_c - rise >= least_c)
         };
-        state.fast.rises(now, temperature_c).any(is_fast) || state.slow.rises(now, temperature_c).any(is_ahead)
+        let mut fast = state.fast.rises(now, temperature_c).map(rise_above);
+        let mut slow = state.slow.rises(now, temperature_c).map(rise_above);
+        (fast.any(is_fast) || slow.any(is_ahead)) && !self.is_behind_others(now, sensor, temperature_c)
+    }
+
+    /// Whether a temperature is below the median of the other sensors, as that of a sensor that returns from a failure.
+    fn is_behind_others(&self, now: Timestamp, sensor: usize, temperature_c: f64) -> bool {
+        let others = self.sensors.iter().enumerate().filter(|(index, _)| *index != sensor);
+        let latest = others.filter_map(|(_, other)| other.fast.0.back().filter(|(at, _)| now.since(*at) <= WINDOW_S));
+        let latest: Vec<f64> = latest.map(|(_, value)| *value).collect();
+        latest.len() > 1 && median(latest.iter().copied()).is_some_and(|middle| temperature_c < middle)
     }
 
     /// Median rise of the other sensors in the last `age_s` (degrees C), at least 0; `None` without two other sensors.
@@ -344,9 +359,13 @@ impl ThermalWatch {
         if (0.0..REFRESH_S).contains(&elapsed_s) {
             return false;
         }
+        let is_judged =
+            |cell: &CellState| cell.fall.is_some_and(|fall| (0.0..WINDOW_S).contains(&now.since(fall.since)));
+        let judged: Vec<bool> = self.cells.iter().map(is_judged).collect();
         for (index, cell) in self.cells.iter_mut().enumerate() {
-            // A fallen voltage is no reference as long as the fall is judged.
-            if cell.fall.is_some_and(|fall| (0.0..WINDOW_S).contains(&now.since(fall.since))) {
+            // As long as a fall is judged, neither its voltage nor those of its neighbours are references.
+            let around = index.saturating_sub(1)..judged.len().min(index + 2);
+            if judged[around].contains(&true) {
                 continue;
             }
             self.falling -= usize::from(cell.fall.take().is_some());

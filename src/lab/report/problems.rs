@@ -89,7 +89,8 @@ fn of_battery(
     let mut of_charge = groups.iter().position(|group| is_charge(group[0].kind));
     if let Some((pack, at)) = imbalance.zip(of_charge) {
         let (mean, std) = percent(pack);
-        problems[at].what += &format!(" Because of imbalance, {mean:.1} \u{b1} {std:.1} % of the pack's capacity cannot be used.");
+        problems[at].what +=
+            &format!(" Because of imbalance, {mean:.1} \u{b1} {std:.1} % of the pack's capacity cannot be used.");
     } else if let Some(pack) = imbalance.filter(|pack| is_unbalanced(pack)) {
         of_charge = Some(problems.len());
         problems.push(unbalanced(pack, findings.is_empty()));

@@ -196,9 +196,15 @@ fn heat_of_current_is_deducted() {
 
 #[test]
 fn disturbed_temperature_raises_no_event() {
-    let cases: [(&str, fn(u32) -> f64); 9] = [
+    let cases: [(&str, fn(u32) -> f64); 10] = [
         ("return from a failure", |second| if second < 30 { -40.0 } else { 25.0 - 65.0 * decay(second - 30, 5.0) }),
         ("slow return", |second| if second < 30 { -40.0 } else { 25.0 - 65.0 * decay(second - 30, 20.0) }),
+        (
+            "return from a long failure",
+            |second| {
+                if second < 300 { -40.0 } else { 25.0 - 65.0 * decay(second - 300, 5.0) }
+            },
+        ),
         ("noise", |second| (25.0 + 2.0 * noise(second)).round()),
         ("jump with a slow rise", |second| 25.0 + f64::from(second.min(10) / 10) * 7.0 + 0.05 * f64::from(second)),
         ("one jump", |second| if second < 10 { 25.0 } else { 215.0 }),
@@ -208,7 +214,7 @@ fn disturbed_temperature_raises_no_event() {
         ("not a number", |second| if second < 10 { 25.0 } else { f64::NAN }),
     ];
     for (name, temperature_c) in cases {
-        let found = Pack::at_rest().run(200, |second, pack| pack.temperatures_c[0] = temperature_c(second));
+        let found = Pack::at_rest().run(400, |second, pack| pack.temperatures_c[0] = temperature_c(second));
         assert_eq!(found, None, "{name}");
     }
 }
