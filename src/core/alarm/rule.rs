@@ -247,9 +247,9 @@ impl Rule {
 /// Values of [`Rule::ThermalEvent`] in words.
 const EVIDENCE: [&str; 4] = [
     "no evidence now",
-    "its voltage collapses",
-    "its temperature rises faster than the current explains",
-    "its voltage collapses and its temperature rises",
+    "voltage collapses",
+    "temperature rises faster than the current explains",
+    "voltage collapses and temperature rises",
 ];
 
 /// Severity; the values are the wire codes.

@@ -52,6 +52,10 @@ const UNKNOWN_RATE_PER_H: f64 = 1.0;
 const REFRESH_S: f64 = 30.0;
 /// A temperature is not judged for this long after its first reading (s), because the filter of its sensor settles.
 const SETTLE_S: f64 = 60.0;
+/// A cell cannot cool by more than this between two readings (degrees C) at more than this rate (degrees C/s).
+const IMPOSSIBLE_FALL: (f64, f64) = (5.0, 0.5);
+/// Longest time for which a failed sensor must exceed its reading before the failure (s).
+const FLOOR_S: f64 = 3600.0;
 /// Evidence lasts this long after the last reading that shows it (s).
 const HOLD_S: f64 = 60.0;
 /// A cell whose SOC may be below this is not judged by its voltage.
@@ -69,24 +73,32 @@ pub struct ThermalWatch {
     /// Number of cells with a fall.
     falling: usize,
     refreshed: Option<Timestamp>,
-    /// Currents at the last two refreshes (1/h, without sign).
-    rates_per_h: [f64; 2],
 }
 
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct CellState {
-    latest_v: Option<f64>,
+    /// Latest voltage (V).
+    latest: Option<(Timestamp, f64)>,
     /// Whether a voltage has arrived since the last refresh.
     is_fresh: bool,
     /// Voltages at the last two refreshes.
-    references_v: [Option<f64>; 2],
+    references: [Option<Reference>; 2],
     /// Whether the cell may have been almost empty at the last refresh.
     may_be_empty: bool,
     fall: Option<Fall>,
     /// Until when there is evidence.
     collapsed_until: Option<Timestamp>,
     heating_until: Option<Timestamp>,
+}
+
+/// A voltage with which later voltages are compared.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Reference {
+    voltage_v: f64,
+    /// Current at that time (1/h); `None` = unknown.
+    rate_per_h: Option<f64>,
 }
 
 /// A voltage that is far below its reference.
@@ -105,13 +117,24 @@ struct Fall {
 struct SensorState {
     /// Time of the first reading after a break.
     first: Option<Timestamp>,
-    latest: Option<Timestamp>,
+    latest: Option<(Timestamp, f64)>,
+    floor: Option<Floor>,
     fast: Trail,
     slow: Trail,
     /// Mean square of the current (1/h^2).
     heat: f64,
     /// A reading that showed a rise and has not been confirmed.
     shown: Option<(Timestamp, f64)>,
+}
+
+/// Reading of a sensor before it failed. Until the sensor has returned, only a rise above this reading counts.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Floor {
+    since: Timestamp,
+    temperature_c: f64,
+    /// Since when the readings are near the floor or above it.
+    returned: Option<Timestamp>,
 }
 
 /// Recent readings of a sensor.
@@ -132,15 +155,20 @@ impl Trail {
         }
     }
 
-    /// Age (s) of each reading since which the temperature has only risen, in at least [`LEAST_READINGS`] steps up to
-    /// `value`, and the rise since then (degrees C). The largest step does not count, because it may be a disturbance.
-    fn rises(&self, now: Timestamp, value: f64) -> impl Iterator<Item = (f64, f64)> + '_ {
-        let (mut next, mut steps, mut largest) = (value, 0, 0.0_f64);
+    /// The rise up to `value` since each reading since which the temperature has only risen, in at least
+    /// [`LEAST_READINGS`] steps. The largest step does not count, because it may be a disturbance.
+    fn rises(&self, now: Timestamp, value: f64) -> impl Iterator<Item = Rise> + '_ {
+        let (mut next, mut steps, mut largest) = ((now, value), 0, (0.0, 0.0));
         let rises = self.0.iter().rev().map_while(move |&(time, earlier)| {
-            steps += u32::from(earlier < next);
-            largest = largest.max(next - earlier);
-            let has_fallen = std::mem::replace(&mut next, earlier) < earlier;
-            (!has_fallen).then(|| (steps >= LEAST_READINGS).then(|| (now.since(time), value - earlier - largest)))
+            let (step_s, step_c) = (next.0.since(time), next.1 - earlier);
+            next = (time, earlier);
+            steps += u32::from(step_c > 0.0);
+            if step_c > largest.1 {
+                largest = (step_s, step_c);
+            }
+            let age_s = now.since(time);
+            let rise = Rise { age_s, seconds: age_s - largest.0, rise_c: value - earlier - largest.1 };
+            (step_c >= 0.0 && age_s <= WINDOW_S).then(|| (steps >= LEAST_READINGS).then_some(rise))
         });
         rises.flatten()
     }
@@ -156,9 +184,25 @@ impl Trail {
         self.0.iter().find(|(at, _)| *at >= time).map(|(_, value)| *value)
     }
 
+    /// Whether a rise can be judged.
+    fn has_enough(&self, now: Timestamp) -> bool {
+        let recent = self.0.iter().filter(|(at, _)| now.since(*at) <= WINDOW_S);
+        recent.count() > LEAST_READINGS as usize
+    }
+
     fn is_valid(&self, (_, length): (f64, usize)) -> bool {
         self.0.len() <= length && self.0.iter().is_sorted_by(|a, b| a.0 <= b.0)
     }
+}
+
+/// Rise of a temperature without its largest step.
+#[derive(Debug, Clone, Copy)]
+struct Rise {
+    /// Time since the rise began (s).
+    age_s: f64,
+    /// Time of the steps that count (s).
+    seconds: f64,
+    rise_c: f64,
 }
 
 /// Rises that the current explains.
@@ -204,11 +248,16 @@ impl ThermalWatch {
     /// # Errors
     /// The first impossible number.
     pub fn check(&self) -> Result<(), InvalidState> {
-        let voltages =
-            self.cells.iter().flat_map(|cell| cell.references_v.into_iter().chain([cell.latest_v])).flatten();
+        let voltages = self.cells.iter().flat_map(|it| {
+            let references = it.references.into_iter().flatten();
+            let numbers = references.flat_map(|it| [Some(it.voltage_v), it.rate_per_h]);
+            numbers.chain([it.latest.map(|it| it.1)])
+        });
         let trails = self.sensors.iter().flat_map(|sensor| sensor.fast.0.iter().chain(&sensor.slow.0));
+        let floors = self.sensors.iter().filter_map(|sensor| sensor.floor).map(|floor| floor.temperature_c);
+        let latest = self.sensors.iter().filter_map(|sensor| Some(sensor.latest?.1));
         let temperatures = trails.map(|(_, value)| *value).chain(self.sensors.iter().map(|sensor| sensor.heat));
-        let readings = voltages.chain(temperatures).chain(self.rates_per_h);
+        let readings = voltages.flatten().chain(temperatures).chain(floors).chain(latest);
         InvalidState::unless_numbers("a reading of the thermal watch", readings)?;
         let falling = self.cells.iter().filter(|cell| cell.fall.is_some()).count();
         let has_trails = self.sensors.iter().all(|it| it.fast.is_valid(FAST) && it.slow.is_valid(SLOW));
@@ -227,7 +276,7 @@ impl ThermalWatch {
         rate_per_h: impl FnOnce() -> Option<f64>,
     ) -> bool {
         let Some(state) = self.cells.get_mut(cell.index()).filter(|_| voltage_v.is_finite()) else { return false };
-        (state.latest_v, state.is_fresh) = (Some(voltage_v), true);
+        (state.latest, state.is_fresh) = (Some((now, voltage_v)), true);
         if state.share_left().is_none_or(|share| share >= 1.0 - FALL) {
             self.falling -= usize::from(state.fall.take().is_some());
             return false;
@@ -263,14 +312,23 @@ impl ThermalWatch {
         let middle_v = median(others().filter_map(CellState::reference_v));
         let own = &self.cells[cell];
         let (Some(middle), Some(middle_v)) = (median(shares.iter().copied()), middle_v) else { return false };
-        let (Some(latest_v), Some(reference_v)) = (own.latest_v, own.reference_v()) else { return false };
-        let rate_per_h = rate_per_h.unwrap_or(UNKNOWN_RATE_PER_H).abs() + self.rates_per_h[0].max(self.rates_per_h[1]);
+        let (Some((_, latest_v)), Some(reference_v), Some(fall)) = (own.latest, own.reference_v(), own.fall) else {
+            return false;
+        };
+        let change = |before: Option<f64>| {
+            rate_per_h.zip(before).map_or(UNKNOWN_RATE_PER_H, |(rate_per_h, before)| (rate_per_h - before).abs())
+        };
+        let changes = own.references.iter().flatten().map(|reference| change(reference.rate_per_h));
+        let explained_v = EXPLAINED_V * changes.fold(0.0, f64::max);
         // A higher reference was no voltage of the cell.
-        let reference_v = reference_v.min(HIGHEST_SHARE * middle_v);
-        let share = (latest_v + EXPLAINED_V * rate_per_h) / reference_v;
-        let neighbours = [cell.checked_sub(1), Some(cell + 1)].into_iter().flatten();
-        let rise = neighbours.filter_map(|index| self.cells.get(index)?.share_left()).fold(1.0, f64::max) - 1.0;
-        shares.len() > 1 && share <= middle.min(1.0) - FALL && rise < 0.5 * (1.0 - latest_v / reference_v)
+        let share = (latest_v + explained_v) / reference_v.min(HIGHEST_SHARE * middle_v);
+        let is_sound = |neighbour: &CellState| {
+            let has_reported = neighbour.latest.is_some_and(|(at, _)| at >= fall.since);
+            neighbour.share_left().is_none_or(|share| has_reported && share < HIGHEST_SHARE)
+        };
+        let around = [cell.checked_sub(1), Some(cell + 1)].into_iter().flatten();
+        let mut neighbours = around.filter_map(|at| self.cells.get(at));
+        shares.len() > 1 && share <= middle.min(1.0) - FALL && neighbours.all(is_sound)
     }
 
     /// Handles a reading of a temperature sensor (degrees C). `rate_per_h`: current relative to the rated capacity; `None`
@@ -285,7 +343,8 @@ impl ThermalWatch {
     ) -> Option<CellIndex> {
         let state = self.sensors.get_mut(sensor.index()).filter(|_| temperature_c.is_finite())?;
         let present = square(rate_per_h.unwrap_or(UNKNOWN_RATE_PER_H));
-        let elapsed_s = state.latest.replace(now).map_or(0.0, |latest| now.since(latest)).max(0.0);
+        let elapsed_s = state.latest.map_or(0.0, |(latest, _)| now.since(latest)).max(0.0);
+        state.note_failure(now, temperature_c, elapsed_s);
         state.heat += (present - state.heat) * -libm::expm1(-elapsed_s / HEAT_S);
         let heat = Heat { square_per_h2: state.heat.max(present) };
         if !(SETTLE_S..).contains(&now.since(*state.first.get_or_insert(now))) {
@@ -312,18 +371,20 @@ impl ThermalWatch {
     /// sensors showed before.
     fn is_rising(&self, now: Timestamp, sensor: usize, temperature_c: f64, heat: Heat) -> bool {
         let state = &self.sensors[sensor];
-        let rise_above = |(age_s, rise_c): (f64, f64)| {
-            let highest_c = state.slow.highest_until(now.plus_secs(-age_s));
-            (age_s, rise_c.min(temperature_c - highest_c))
+        let floor_c = state.floor.map_or(f64::NEG_INFINITY, |floor| floor.temperature_c);
+        let above_before = |rise: Rise| {
+            let before_c = state.slow.highest_until(now.plus_secs(-rise.age_s)).max(floor_c);
+            Rise { rise_c: rise.rise_c.min(temperature_c - before_c), ..rise }
         };
-        let is_fast =
-            |(age_s, rise_c): (f64, f64)| age_s >= LEAST_S && rise_c - heat.explained_c(age_s) >= RATE_C_PER_S * age_s;
-        let is_ahead = |(age_s, rise_c): (f64, f64)| {
-            let least_c = AHEAD_C + heat.explained_difference_c();
+        let is_fast = |Rise { age_s, seconds, rise_c }: Rise| {
+            age_s >= LEAST_S && rise_c - heat.explained_c(age_s) >= RATE_C_PER_S * seconds
+        };
+        let least_c = AHEAD_C + heat.explained_difference_c();
+        let is_ahead = |Rise { age_s, rise_c, .. }: Rise| {
             rise_c >= least_c && self.rise_of_others(now, sensor, age_s).is_some_and(|rise| rise_c - rise >= least_c)
         };
-        let mut fast = state.fast.rises(now, temperature_c).map(rise_above);
-        let mut slow = state.slow.rises(now, temperature_c).map(rise_above);
+        let mut fast = state.fast.rises(now, temperature_c).map(above_before);
+        let mut slow = state.slow.rises(now, temperature_c).map(above_before);
         (fast.any(is_fast) || slow.any(is_ahead)) && !self.is_behind_others(now, sensor, temperature_c)
     }
 
@@ -370,10 +431,10 @@ impl ThermalWatch {
             }
             self.falling -= usize::from(cell.fall.take().is_some());
             let is_fresh = std::mem::take(&mut cell.is_fresh);
-            cell.references_v = [cell.references_v[1], cell.latest_v.filter(|_| is_fresh)];
+            let reference = |(_, voltage_v)| Reference { voltage_v, rate_per_h };
+            cell.references = [cell.references[1], cell.latest.filter(|_| is_fresh).map(reference)];
             cell.may_be_empty = least_soc(index).is_none_or(|soc| soc < ALMOST_EMPTY);
         }
-        self.rates_per_h = [self.rates_per_h[1], rate_per_h.unwrap_or(UNKNOWN_RATE_PER_H).abs()];
         self.refreshed = Some(now);
         true
     }
@@ -390,8 +451,7 @@ impl ThermalWatch {
             let value = state.evidence(now);
             let is_compared = compared > 2 && state.reference_v().is_some() && !state.may_be_empty;
             let sensor = sensor.and_then(|sensor| self.sensors.get(sensor.index()));
-            let is_watched =
-                || sensor.is_some_and(|it| it.slow.0.back().is_some_and(|(at, _)| now.since(*at) <= WINDOW_S));
+            let is_watched = || sensor.is_some_and(|sensor| sensor.slow.has_enough(now));
             (cell, (value > 0.0 || is_compared || is_watched()).then_some(value))
         })
     }
@@ -402,16 +462,40 @@ impl ThermalWatch {
     }
 }
 
+impl SensorState {
+    /// Notes the latest reading. If the sensor has failed since the last one, or was silent, the judgement begins again.
+    fn note_failure(&mut self, now: Timestamp, temperature_c: f64, elapsed_s: f64) {
+        let (least_c, rate_c_per_s) = IMPOSSIBLE_FALL;
+        if let Some((_, before_c)) = self.latest.replace((now, temperature_c)) {
+            let fall_c = before_c - temperature_c;
+            if (fall_c > least_c && fall_c > rate_c_per_s * elapsed_s) || elapsed_s > SETTLE_S {
+                let highest_c = self.floor.map_or(before_c, |floor| floor.temperature_c.max(before_c));
+                self.floor = Some(Floor { since: now, temperature_c: highest_c, returned: None });
+                (self.first, self.shown) = (Some(now), None);
+                self.fast.0.clear();
+                self.slow.0.clear();
+            }
+        }
+        let Some(floor) = &mut self.floor else { return };
+        let is_near = temperature_c >= floor.temperature_c - least_c;
+        floor.returned = floor.returned.or(Some(now)).filter(|_| is_near);
+        let has_returned = floor.returned.is_some_and(|returned| now.since(returned) > WINDOW_S);
+        if has_returned || !(0.0..FLOOR_S).contains(&now.since(floor.since)) {
+            self.floor = None;
+        }
+    }
+}
+
 impl CellState {
     /// The lower of the last two references, so that one disturbed reading counts for nothing; `None` in the first minute.
     fn reference_v(&self) -> Option<f64> {
-        let [before_v, last_v] = self.references_v;
+        let [before_v, last_v] = self.references.map(|reference| Some(reference?.voltage_v));
         Some(before_v?.min(last_v?)).filter(|voltage_v| *voltage_v > 0.0)
     }
 
     /// The latest voltage relative to the reference.
     fn share_left(&self) -> Option<f64> {
-        Some(self.latest_v? / self.reference_v()?)
+        Some(self.latest?.1 / self.reference_v()?)
     }
 
     fn evidence(&self, now: Timestamp) -> f64 {

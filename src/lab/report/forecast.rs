@@ -13,8 +13,6 @@ use crate::alarm::Rule;
 use crate::health::{Axis, CapacityReading, Forecast, InsufficientData, Remaining, RemainingLife, Usage};
 use crate::quantity::DAY_S;
 
-/// An interval is vague if it is longer than this multiple of the median.
-const VAGUE: f64 = 10.0;
 /// Number of points of a fan.
 const POINTS: usize = 60;
 /// Upper limits of the fan's length: [`MAX_MEDIANS`] times the median time to the end of life, and [`MAX_RECORDS`]
@@ -147,11 +145,6 @@ fn fan(data: &Data, forecast: &Forecast, life: &RemainingLife) -> Vec<DatedFanPo
 impl Outlook {
     pub(super) fn is_over(&self) -> bool {
         is_over(&self.life)
-    }
-
-    /// Whether the interval is so wide that the median says nothing.
-    pub(super) fn is_vague(&self) -> bool {
-        self.life.cycles.is_some_and(|left| left.high - left.low > VAGUE * left.median)
     }
 
     /// Returns for example "14 cycles". If the life of another cell is unknown, the result is "unknown", as in the

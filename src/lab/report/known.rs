@@ -56,11 +56,6 @@ impl Knowledge {
         known.resistance(data, context);
         known.recharge(data, context);
         match outlook {
-            Ok(outlook) if outlook.is_vague() => known.gap(
-                "Remaining life",
-                format!("Too uncertain: {}.", outlook.note(data.cells())),
-                "Measured capacities over months of use.",
-            ),
             Ok(outlook) => known.tile("Remaining life", outlook.value(), outlook.note(data.cells())),
             Err(why) => known.gap("Remaining life", capitalised(why) + ".", "Measured capacities over months of use."),
         }
@@ -102,7 +97,7 @@ impl Knowledge {
         match context.rated_ah(step.cell) {
             Some(rated) => self.tile(
                 "State of health",
-                format!("{:.0} \u{b1} {:.0} %", 100.0 * step.worst.0 / rated, 100.0 * step.worst.1 / rated),
+                format!("{:.1} \u{b1} {:.1} %", 100.0 * step.worst.0 / rated, 100.0 * step.worst.1 / rated),
                 format!("of {rated} Ah rated{}{}", of_cell(data, &step), assumed(measured, &step)),
             ),
             None => self.gap(
@@ -268,11 +263,12 @@ fn teaches_by_label(context: &PageContext<'_>) -> String {
 
 /// Says which alarms were raised in the record, and how often. Alarms of several cells at the same time count once.
 fn raised_before(data: &Data) -> String {
-    let mut times: BTreeMap<&str, BTreeSet<u64>> = BTreeMap::new();
+    let mut times: BTreeMap<&str, BTreeSet<i64>> = BTreeMap::new();
     for row in data.alarms.iter().filter(|row| row.change == "raised") {
-        times.entry(&row.rule).or_default().insert(row.time_s.to_bits());
+        times.entry(&row.rule).or_default().insert((row.time_s / 60.0) as i64);
     }
-    let often = times.iter().map(|(rule, times)| format!("{rule} {} \u{d7}", times.len()));
+    let plural = |count: usize| if count == 1 { "" } else { "s" };
+    let often = times.iter().map(|(rule, times)| format!("{rule} at {} time{}", times.len(), plural(times.len())));
     let often: Vec<String> = often.collect();
     if often.is_empty() { "none in this record".to_owned() } else { format!("in this record: {}", often.join(", ")) }
 }

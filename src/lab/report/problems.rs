@@ -47,6 +47,8 @@ pub(super) struct Problem {
     pub(super) advice: String,
     /// Alarms and dates, as sentences.
     pub(super) note: String,
+    /// Whether an alarm is raised about it.
+    pub(super) is_alarm: bool,
 }
 
 impl Problem {
@@ -54,6 +56,7 @@ impl Problem {
     fn add_alarms(&mut self, alarms: &[&ActiveAlarm<'_>], data: &Data) {
         self.condition = alarms.iter().map(|alarm| condition_of(&alarm.row.severity)).fold(self.condition, Ord::max);
         self.note = format!("{}{}", self.note, alarm_notes(alarms, data)).trim_start().to_owned();
+        self.is_alarm |= !alarms.is_empty();
     }
 }
 
@@ -66,9 +69,10 @@ pub(super) fn problems(data: &Data, context: &PageContext<'_>, outlook: Option<&
         what: format!("The figures may be wrong: {doubt}."),
         advice: "Do not rely on them.".to_owned(),
         note: String::new(),
+        is_alarm: false,
     }));
     // A stable sort: problems of the same condition keep their order, those with a raised alarm first.
-    problems.sort_by_key(|problem| std::cmp::Reverse((problem.condition, problem.note.contains("Alarm "))));
+    problems.sort_by_key(|problem| std::cmp::Reverse((problem.condition, problem.is_alarm)));
     problems
 }
 
@@ -115,6 +119,7 @@ fn of_battery(
             what: format!("The capacity is below the end of life{no_limit}."),
             advice: "Plan its replacement.".to_owned(),
             note: String::new(),
+            is_alarm: false,
         });
     }
     problems
@@ -184,6 +189,7 @@ fn finding(group: &[&CellFault], raised: &[ActiveAlarm<'_>], data: &Data) -> Pro
         what: sentence(kind, &subject, numbers.len() > 1, &sizes(group)) + growth.map_or("", Growth::words),
         advice: growth.and_then(Growth::advice).map_or_else(|| capitalised(kind.advice()) + ".", str::to_owned),
         note: format!("Found {}.{}", moment(data, found_s), alarm_notes(&alarms, data)),
+        is_alarm: !alarms.is_empty(),
     }
 }
 
@@ -343,6 +349,7 @@ fn unbalanced(pack: &Imbalance, is_only: bool) -> Problem {
                  again, it is failing."
                 .to_owned(),
         note: String::new(),
+        is_alarm: false,
     }
 }
 
@@ -357,6 +364,7 @@ fn alarm(group: &AlarmGroup<'_>, data: &Data, context: &PageContext<'_>, outlook
         what: alarm_sentence(group, data, context, outlook),
         advice: rule.map_or("Read the manual of this alarm.", |rule| alarm_advice(rule, condition)).to_owned(),
         note: alarm_notes(&group.alarms, data).trim_start().to_owned(),
+        is_alarm: true,
     }
 }
 
@@ -372,7 +380,7 @@ fn alarm_sentence(group: &AlarmGroup<'_>, data: &Data, context: &PageContext<'_>
         Rule::InputMissing => return format!("Readings of {whose} are missing."),
         Rule::InputImplausible => return format!("Readings of {whose} are implausible."),
         Rule::ChannelFaulty => return format!("The voltage channel of {whose} does not show its cell."),
-        Rule::ThermalEvent => return format!("A thermal event has begun at {whose}: {}.", evidence(group)),
+        Rule::ThermalEvent => return format!("The readings of {whose} show a thermal event{}.", evidence(group)),
         _ => {}
     }
     let spec = rule.spec();
@@ -405,7 +413,8 @@ fn alarm_sentence(group: &AlarmGroup<'_>, data: &Data, context: &PageContext<'_>
 fn evidence(group: &AlarmGroup<'_>) -> String {
     let values: Vec<f64> = group.alarms.iter().filter_map(|alarm| alarm.row.value).collect();
     let has = |kind: u8| values.iter().any(|value| *value as u8 & kind != 0);
-    Rule::ThermalEvent.with_unit(f64::from(u8::from(has(1)) + 2 * u8::from(has(2))))
+    let value = u8::from(has(1)) + 2 * u8::from(has(2));
+    if value == 0 { String::new() } else { format!(": {}", Rule::ThermalEvent.with_unit(f64::from(value))) }
 }
 
 fn condition_of(severity: &str) -> Condition {

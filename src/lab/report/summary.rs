@@ -69,6 +69,7 @@ fn no_problem(data: &Data, context: &PageContext<'_>, knowledge: &Knowledge) -> 
         what,
         advice: advice.to_owned(),
         note: String::new(),
+        is_alarm: false,
     };
     let measured = knowledge.measured_cells;
     let all = context.config.map_or(0, |config| usize::from(config.monitor.sample.cells)).max(data.cells());

@@ -231,7 +231,7 @@ fn alarms_of_96_cells_are_one_problem() {
     assert_eq!(first, "The capacity of cells 1 to 96 was below the limit of 1.82 Ah; now it is 2.147 Ah in cell 96.");
     assert!(raised.contains("Alarm capacity_low (warning) of cells 1 to 96 since"));
     let count = cards(&raised).into_iter().find(|card| card.name == "Alarms raised now").expect("a card");
-    assert_eq!(count.text, "96; in this record: capacity_low 1 \u{d7}");
+    assert_eq!(count.text, "96; in this record: capacity_low at 1 time");
 }
 
 /// Numbers after the plus-minus signs, each with half a unit of its last digit.
