@@ -173,12 +173,6 @@ impl Trail {
         rises.flatten()
     }
 
-    /// Highest reading up to `time`.
-    fn highest_until(&self, time: Timestamp) -> f64 {
-        let before = self.0.iter().take_while(|(at, _)| *at <= time);
-        before.fold(f64::NEG_INFINITY, |highest, (_, value)| highest.max(*value))
-    }
-
     /// The reading at `time`, or the next reading after it.
     fn at(&self, time: Timestamp) -> Option<f64> {
         self.0.iter().find(|(at, _)| *at >= time).map(|(_, value)| *value)
@@ -367,15 +361,12 @@ impl ThermalWatch {
         named.is_none().then(|| CellIndex(u16::try_from(cell).unwrap_or(u16::MAX)))
     }
 
-    /// Whether a temperature rises faster than the current and the other sensors explain, to more than it and the other
-    /// sensors showed before.
+    /// Whether a temperature rises faster than the current and the other sensors explain, above the reading before a
+    /// failure of the sensor.
     fn is_rising(&self, now: Timestamp, sensor: usize, temperature_c: f64, heat: Heat) -> bool {
         let state = &self.sensors[sensor];
         let floor_c = state.floor.map_or(f64::NEG_INFINITY, |floor| floor.temperature_c);
-        let above_before = |rise: Rise| {
-            let before_c = state.slow.highest_until(now.plus_secs(-rise.age_s)).max(floor_c);
-            Rise { rise_c: rise.rise_c.min(temperature_c - before_c), ..rise }
-        };
+        let above_floor = |rise: Rise| Rise { rise_c: rise.rise_c.min(temperature_c - floor_c), ..rise };
         let is_fast = |Rise { age_s, seconds, rise_c }: Rise| {
             age_s >= LEAST_S && rise_c - heat.explained_c(age_s) >= RATE_C_PER_S * seconds
         };
@@ -383,8 +374,8 @@ impl ThermalWatch {
         let is_ahead = |Rise { age_s, rise_c, .. }: Rise| {
             rise_c >= least_c && self.rise_of_others(now, sensor, age_s).is_some_and(|rise| rise_c - rise >= least_c)
         };
-        let mut fast = state.fast.rises(now, temperature_c).map(above_before);
-        let mut slow = state.slow.rises(now, temperature_c).map(above_before);
+        let mut fast = state.fast.rises(now, temperature_c).map(above_floor);
+        let mut slow = state.slow.rises(now, temperature_c).map(above_floor);
         (fast.any(is_fast) || slow.any(is_ahead)) && !self.is_behind_others(now, sensor, temperature_c)
     }
 
@@ -472,8 +463,6 @@ impl SensorState {
                 let highest_c = self.floor.map_or(before_c, |floor| floor.temperature_c.max(before_c));
                 self.floor = Some(Floor { since: now, temperature_c: highest_c, returned: None });
                 (self.first, self.shown) = (Some(now), None);
-                self.fast.0.clear();
-                self.slow.0.clear();
             }
         }
         let Some(floor) = &mut self.floor else { return };

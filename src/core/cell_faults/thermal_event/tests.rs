@@ -91,6 +91,11 @@ fn other_falls_raise_no_event() {
         pack.volts[3] = 5.0;
     };
     assert_eq!(rest().run(300, clamped), None, "sense wire, channel at its limit");
+    let refused = |second: u32, pack: &mut Pack| {
+        pack.volts[2] = 0.1 + moving(second);
+        pack.volts[3] = f64::NAN;
+    };
+    assert_eq!(rest().run(100, refused), None, "sense wire, channel without readings");
     assert_eq!(rest().run(300, |second, pack| pack.volts = [2.6 + moving(second); CELLS]), None, "all cells");
     let half = |second: u32, pack: &mut Pack| pack.volts[..4].fill(2.6 + moving(second));
     assert_eq!(rest().run(300, half), None, "most cells");
@@ -103,12 +108,12 @@ fn other_falls_raise_no_event() {
     let contact = |second: u32, pack: &mut Pack| {
         pack.rate_per_h = Some(2.0);
         pack.volts = [3.6; CELLS];
-        pack.volts[2] = 2.4 + moving(second);
+        pack.volts[2] = 1.8 + moving(second);
     };
     assert_eq!(rest().run(300, contact), None, "contact under load");
     let both = |second: u32, pack: &mut Pack| {
         contact(second, pack);
-        pack.volts[2] = 0.5 + moving(second);
+        pack.volts[2] = 1.5 + moving(second);
     };
     assert!(rest().run(300, both).is_some(), "collapse under load");
     let mut charge = Pack { rate_per_h: Some(-3.0), volts: [4.0; CELLS], ..rest() };
@@ -255,6 +260,16 @@ fn sensor_that_returns_from_failure_raises_no_event() {
             }
         }
     }
+}
+
+#[test]
+fn sensor_that_failed_before_start_raises_no_event() {
+    let mut pack = Pack::at_rest();
+    pack.watch.interrupt();
+    let back = |second: u32, pack: &mut Pack| {
+        pack.temperatures_c[0] = if second < 300 { -40.0 } else { 24.0 - 64.0 * decay(second - 300, 10.0) };
+    };
+    assert_eq!(pack.run(600, back), None);
 }
 
 #[test]
