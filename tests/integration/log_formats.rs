@@ -215,6 +215,6 @@ fn look_writes_report_or_asks() {
 fn default_sleep_gap_follows_maximum_age() {
     let gap_s = |limits: &str| replay::sleep_gap_s(&config_texts::load(&format!("{PACK}{limits}"), DBC).monitor);
     assert_eq!(gap_s(""), 30.0);
-    assert_eq!(gap_s("[limits.current]\nmax_age_s = 90.0\n"), 360.0);
-    assert_eq!(gap_s("[limits.voltage]\nmax_age_s = 20.0\n"), 80.0);
+    assert_eq!(gap_s("[limits.current]\nmax_age_s = 90.0\n"), 90.0);
+    assert_eq!(gap_s("[limits.voltage]\nmax_age_s = 70.0\n"), 70.0);
 }

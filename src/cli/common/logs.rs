@@ -28,7 +28,7 @@ pub(crate) struct InputArgs {
     #[arg(long)]
     pub(crate) strict: bool,
     /// Count a gap longer than this as sleep of the recorder: during the gap, nothing is computed and no frame is made
-    /// [default: four times the max_age_s of current and voltage, at least 30]
+    /// [default: the largest max_age_s of current and voltages, at least 30]
     #[arg(long, value_name = "SECONDS", value_parser = positive)]
     pub(crate) sleep_gap: Option<f64>,
     /// Read a channel or interface of a log as this interface, for example 2=can0. CHANNEL is written as in the log. By

@@ -10,16 +10,15 @@ use crate::io::csv_log::CsvOptions;
 use crate::io::log::LogOptions;
 use crate::monitor::MonitorConfig;
 use crate::quantity::BusIndex;
-use crate::sample::{SHORT_GAP, VoltageSource};
+use crate::sample::VoltageSource;
 
 /// Shortest default of the sleep gap (s).
 const LEAST_SLEEP_GAP_S: f64 = 30.0;
 
-/// Default sleep gap (s). In a longer gap of a log, the recorder counts as asleep. The sampler bridges gaps of up to
-/// [`SHORT_GAP`] times the maximum age, so the recorder does not count as asleep in such a gap.
+/// Default sleep gap (s). In a longer gap of a log, the recorder counts as asleep. While a current or a voltage is
+/// fresh, the recorder does not count as asleep.
 pub fn sleep_gap_s(config: &MonitorConfig) -> f64 {
-    let max_age_s = config.sample.current.max_age_s.max(config.sample.voltage.max_age_s);
-    LEAST_SLEEP_GAP_S.max(SHORT_GAP * max_age_s)
+    LEAST_SLEEP_GAP_S.max(config.sample.current.max_age_s).max(config.sample.voltage.max_age_s)
 }
 
 /// Settings for reading logs.
