@@ -22,7 +22,7 @@ pub(crate) enum CsvSign {
 }
 
 /// Options for reading logs.
-#[derive(Debug, clap::Args)]
+#[derive(Debug, Default, clap::Args)]
 pub(crate) struct InputArgs {
     /// Stop with an error at the first line that cannot be read
     #[arg(long)]
@@ -48,19 +48,6 @@ pub(crate) struct InputArgs {
     /// column, for example `cycle`, and `start`
     #[arg(long, value_name = "TABLE.csv")]
     pub(crate) start_times: Option<PathBuf>,
-}
-
-impl Default for InputArgs {
-    fn default() -> Self {
-        Self {
-            strict: false,
-            sleep_gap: None,
-            channels: Vec::new(),
-            columns: Vec::new(),
-            csv_sign: None,
-            start_times: None,
-        }
-    }
 }
 
 impl InputArgs {

@@ -196,7 +196,7 @@ fn heat_of_current_is_deducted() {
     // 4 C: 1.6 degrees C/s at first, 80 in all, 16 between the sensors.
     let mut pack = Pack { rate_per_h: Some(-4.0), ..Pack::at_rest() };
     let mut warmer = |_, pack: &mut Pack| {
-        pack.temperatures_c = pack.temperatures_c.map(|it| it + 0.05 * (105.0 - it).max(0.0).min(32.0));
+        pack.temperatures_c = pack.temperatures_c.map(|it| it + 0.05 * (105.0 - it).clamp(0.0, 32.0));
         pack.temperatures_c[1] = 25.0 + 1.15 * (pack.temperatures_c[0] - 25.0);
     };
     assert_eq!(pack.run(120, &mut warmer), None);
@@ -205,7 +205,8 @@ fn heat_of_current_is_deducted() {
 
 #[test]
 fn disturbed_temperature_raises_no_event() {
-    let cases: [(&str, fn(u32) -> f64); 10] = [
+    type Readings = (&'static str, fn(u32) -> f64);
+    let cases: [Readings; 10] = [
         ("return from a failure", |second| if second < 30 { -40.0 } else { 25.0 - 65.0 * decay(second - 30, 5.0) }),
         ("slow return", |second| if second < 30 { -40.0 } else { 25.0 - 65.0 * decay(second - 30, 20.0) }),
         (
