@@ -173,7 +173,7 @@ fn fit_logs(
     let logs = LogRequest {
         monitor: &config.monitor,
         interfaces: config.interface_names(),
-        sleep_gap_s: args.input.sleep_gap,
+        sleep_gap_s: args.input.sleep_gap_s(&config.monitor),
         options: &|| log_options(&args.input, &config),
         logs: args.files.clone(),
     };

@@ -102,7 +102,7 @@ fn settings(args: &Args, config: &Config) -> Result<ReplaySettings, Failure> {
 
 /// Settings for a replay of the selected part of the log at full speed, without storing anything.
 fn plain_settings(args: &Args, config: &Config) -> ReplaySettings {
-    let plain = ReplaySettings::plain(args.input.sleep_gap, config.interface_names());
+    let plain = ReplaySettings::plain(args.input.sleep_gap_s(&config.monitor), config.interface_names());
     ReplaySettings { from: args.from, until: args.until, ..plain }
 }
 

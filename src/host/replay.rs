@@ -30,7 +30,7 @@ use crate::quantity::catalogue::RecordedValues;
 use crate::quantity::{BusIndex, CellIndex, Timestamp};
 use crate::sample::ReadingCounts;
 
-pub use crate::io::reading::{LogReading, RowFrames, SLEEP_GAP_S};
+pub use crate::io::reading::{LogReading, RowFrames, sleep_gap_s};
 pub use cells::CellSummary;
 pub use clock::LogTime;
 use clock::{Pace, RecordSpan, TimeWindow, WindowPosition};

@@ -12,7 +12,7 @@ use packwatch_host::config::Config;
 use packwatch_host::io::plausible;
 use packwatch_host::monitor::MonitorConfig;
 use packwatch_host::quantity::{BusIndex, CellIndex, Timestamp};
-use packwatch_host::replay::MonitorDriver;
+use packwatch_host::replay::{self, MonitorDriver};
 use packwatch_host::sample::{Limits, VoltageSource};
 use packwatch_lab::single_cell::CellSource;
 use pyo3::prelude::*;
@@ -23,6 +23,7 @@ use crate::background_task::{self, BackgroundTask, Progress};
 use crate::error::{config as config_error, data};
 use crate::exclusive_state::ExclusiveState;
 use crate::outputs::{Columns, Outputs, Wanted};
+use crate::replay::check_sleep_gap;
 
 /// Number of rows between two progress reports.
 const REPORT_EVERY: usize = 16_384;
@@ -54,7 +55,7 @@ impl Monitor {
     /// Creates a monitor without learned values.
     #[new]
     #[pyo3(signature = (config=None, *, text=None, folder=None, cell=None, chemistry=None, rated_ah=None, voltage_min_v=None,
-                        voltage_max_v=None, sleep_gap_s=30.0, estimates_period_s=0.0))]
+                        voltage_max_v=None, sleep_gap_s=None, estimates_period_s=0.0))]
     #[expect(clippy::too_many_arguments, reason = "keyword arguments of Python")]
     fn new(
         py: Python<'_>,
@@ -66,12 +67,10 @@ impl Monitor {
         rated_ah: Option<f64>,
         voltage_min_v: Option<f64>,
         voltage_max_v: Option<f64>,
-        sleep_gap_s: f64,
+        sleep_gap_s: Option<f64>,
         estimates_period_s: Option<f64>,
     ) -> PyResult<Self> {
-        if sleep_gap_s.is_nan() || sleep_gap_s <= 0.0 {
-            return Err(data(format!("sleep_gap_s = {sleep_gap_s}, must be above 0")));
-        }
+        check_sleep_gap(sleep_gap_s)?;
         let wanted = Wanted::new(estimates_period_s)?;
         let source = cell_source(config, cell, (chemistry, rated_ah, voltage_min_v, voltage_max_v))?;
         let is_cell = source != CellSource::default();
@@ -187,8 +186,9 @@ impl Monitor {
 }
 
 impl Monitor {
-    fn of(config: &Config, sleep_gap_s: f64, wanted: Wanted) -> Self {
+    fn of(config: &Config, sleep_gap_s: Option<f64>, wanted: Wanted) -> Self {
         let sample = &config.monitor.sample;
+        let sleep_gap_s = sleep_gap_s.unwrap_or_else(|| replay::sleep_gap_s(&config.monitor));
         let driver = MonitorDriver::new(config.monitor.clone(), sleep_gap_s);
         Self {
             interfaces: config.interface_names(),

@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use packwatch_host::config::{self, Config};
 use packwatch_host::io::log::LogSource;
 use packwatch_host::monitor::{Monitor, Outputs as CoreOutputs};
-use packwatch_host::replay::{self as host_replay, LogReading, ReplayError, ReplaySettings, SLEEP_GAP_S, Sinks};
+use packwatch_host::replay::{self as host_replay, LogReading, ReplayError, ReplaySettings, Sinks};
 use pyo3::exceptions::PyBrokenPipeError;
 use pyo3::prelude::*;
 
@@ -16,10 +16,6 @@ use crate::arguments::{List, bytes, of_json};
 use crate::background_task::{self, BackgroundTask, Progress};
 use crate::error::{self, data};
 use crate::outputs::{Columns, Outputs, Wanted};
-
-// The Python signatures of `replay` and of `Monitor` repeat this number as a literal, because Python shows the
-// signatures to users.
-const _: () = assert!(SLEEP_GAP_S == 30.0);
 
 /// Results of a replay.
 #[pyclass(frozen, module = "packwatch")]
@@ -62,7 +58,7 @@ impl Replay {
 
 /// Replays logs as one continuous recording.
 #[pyfunction]
-#[pyo3(signature = (config, logs, *, columns=None, csv_sign=None, start_times=None, strict=false, sleep_gap_s=30.0,
+#[pyo3(signature = (config, logs, *, columns=None, csv_sign=None, start_times=None, strict=false, sleep_gap_s=None,
                     estimates_period_s=0.0, progress=false))]
 #[expect(clippy::too_many_arguments, reason = "keyword arguments of Python")]
 pub(crate) fn replay(
@@ -73,7 +69,7 @@ pub(crate) fn replay(
     csv_sign: Option<&str>,
     start_times: Option<PathBuf>,
     strict: bool,
-    sleep_gap_s: f64,
+    sleep_gap_s: Option<f64>,
     estimates_period_s: Option<f64>,
     progress: bool,
 ) -> PyResult<Replay> {
@@ -83,9 +79,7 @@ pub(crate) fn replay(
         Some("charge") => Some(true),
         Some(other) => return Err(data(format!("csv_sign {other:?}, must be discharge or charge"))),
     };
-    if sleep_gap_s.is_nan() || sleep_gap_s <= 0.0 {
-        return Err(data(format!("sleep_gap_s = {sleep_gap_s}, must be above 0")));
-    }
+    check_sleep_gap(sleep_gap_s)?;
     let wanted = Wanted::new(estimates_period_s)?;
     let columns = columns.unwrap_or_default().into_iter().collect();
     let reading = LogReading { strict, channels: Vec::new(), columns, charge_positive, start_times };
@@ -94,11 +88,23 @@ pub(crate) fn replay(
         return Err(data("no logs, must be one or more"));
     }
     let config = py.detach(|| config::load(&config)).map_err(error::config)?;
+    let sleep_gap_s = sleep_gap_s.unwrap_or_else(|| host_replay::sleep_gap_s(&config.monitor));
     let progress = Progress { is_shown: progress, total: Some(bytes(&logs)), unit: "B" };
     let result = background_task::run(py, progress, |work| run(&config, &logs, &reading, (sleep_gap_s, wanted), work))?;
     let (mut outputs, json) = result.map_err(replay_error)?;
     let outputs = outputs.finish(py, &config.interface_names())?;
     Ok(Replay { outputs: Py::new(py, outputs)?, json })
+}
+
+/// Checks a sleep gap (s); `None` = the configuration decides.
+///
+/// # Errors
+/// `DataError` unless the gap is above 0.
+pub(crate) fn check_sleep_gap(sleep_gap_s: Option<f64>) -> PyResult<()> {
+    match sleep_gap_s {
+        Some(gap_s) if gap_s.is_nan() || gap_s <= 0.0 => Err(data(format!("sleep_gap_s = {gap_s}, must be above 0"))),
+        _ => Ok(()),
+    }
 }
 
 fn run(

@@ -4,6 +4,10 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use assert_cmd::Command;
+use packwatch::replay;
+
+use crate::support::config_texts;
+use crate::support::rig::{DBC, PACK};
 
 const START_US: i64 = 1_700_000_000_000_000;
 
@@ -205,4 +209,12 @@ fn look_writes_report_or_asks() {
     let text = stdout(&packwatch(&args).success());
     assert!(text.contains("exists, so it is used as it is"), "{text}");
     assert_eq!(fs::read_to_string(&pack).unwrap(), edited);
+}
+
+#[test]
+fn default_sleep_gap_follows_maximum_age() {
+    let gap_s = |limits: &str| replay::sleep_gap_s(&config_texts::load(&format!("{PACK}{limits}"), DBC).monitor);
+    assert_eq!(gap_s(""), 30.0);
+    assert_eq!(gap_s("[limits.current]\nmax_age_s = 90.0\n"), 90.0);
+    assert_eq!(gap_s("[limits.voltage]\nmax_age_s = 70.0\n"), 70.0);
 }

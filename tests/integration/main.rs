@@ -90,6 +90,7 @@ mod spread_rounds;
 mod store_cli;
 mod support;
 mod tables;
+mod thermal_event;
 mod tuned_constants;
 mod uplink_cli;
 #[cfg(feature = "lab")]

@@ -295,7 +295,7 @@ fn check_report(place: &Place, document: &Value) {
         assert!(page.contains("Learned changes of the model") && page.contains(">learning</td>"), "no history");
         for it in advice {
             let (measurement, left) = (it["measurement"].as_str().unwrap(), it["left_points"].as_f64().unwrap());
-            assert!(page.contains(&format!("<li>{measurement}: {left:.1} points remain</li>")), "no {it}");
+            assert!(page.contains(&format!("<li>{measurement} (error then: {left:.1} points)</li>")), "no {it}");
         }
     }
 }

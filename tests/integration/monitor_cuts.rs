@@ -118,6 +118,9 @@ warning = 0.2
 [[alarm]]
 rule = "channel_faulty"
 warning = 0.5
+[[alarm]]
+rule = "thermal_event"
+severe = 0.5
 "#;
 
 fn is_command(record: &Record) -> bool {

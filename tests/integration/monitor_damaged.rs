@@ -128,7 +128,7 @@ fn names_of(text: &str) -> Vec<&str> {
 fn stored_state_keeps_names_and_order() {
     let snapshot = learned().monitor.snapshot();
     let expected = "version time may_continue time_backwards intake sampling estimation cells modelling learning diagnosis \
-                    alarming sending statistics asleep_since packs";
+                    thermal alarming sending statistics asleep_since packs";
     assert_eq!(names_of(&serde_json::to_string(&snapshot).unwrap()), expected.split_whitespace().collect::<Vec<_>>());
     let mut document = serde_json::to_value(snapshot).unwrap();
     assert!(serde_json::from_value::<Snapshot>(document.clone()).is_ok());

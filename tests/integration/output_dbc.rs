@@ -63,7 +63,7 @@ const FRAMES: usize = 40;
 
 /// Rules in the order of their numbers. Each row: name, factor from the internal unit to the unit in the frame, and
 /// largest tested value.
-const RULES: [(&str, f64, f64); 17] = [
+const RULES: [(&str, f64, f64); 18] = [
     ("CapacityLow", 1.0, 5.0),
     ("UsableCapacityLow", 1.0, 5.0),
     ("RechargePeriodLow", 1.0, 50_000.0),
@@ -81,6 +81,7 @@ const RULES: [(&str, f64, f64); 17] = [
     ("CellLeak", 100.0, 0.4),
     ("ConnectionResistance", 100.0, 8.0),
     ("ChannelFaulty", 1.0, 1.0),
+    ("ThermalEvent", 1.0, 3.0),
 ];
 
 /// Rules on page `rules` of the digest; the other rules are on page `rules_2`.

@@ -139,7 +139,7 @@ def last_alarm(args) -> None:
 RULES = (
     "capacity_low usable_capacity_low recharge_period_low input_missing input_implausible estimate_untrusted resistance_high soc_low "
     "temperature_high cell_imbalance remaining_life_low bms_disagrees store_failed bus_fault cell_leak "
-    "connection_resistance channel_faulty"
+    "connection_resistance channel_faulty thermal_event"
 ).split()
 SEVERITIES = {"info": 1, "warning": 2, "severe": 3}
 NOT_STORED = ("suppressed", "resumed")  # changes without a row in the store

@@ -101,6 +101,9 @@ warning = 0.2
 rule = "channel_faulty"
 warning = 0.5
 [[alarm]]
+rule = "thermal_event"
+severe = 0.5
+[[alarm]]
 rule = "capacity_low"
 warning = 5.0
 [[alarm]]

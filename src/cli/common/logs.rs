@@ -9,7 +9,8 @@ use crate::config::Config;
 use crate::io::csv_log::CsvOptions;
 use crate::io::csv_log::TableReading;
 use crate::io::log::LogOptions;
-use crate::replay::{LogReading, SLEEP_GAP_S};
+use crate::monitor::MonitorConfig;
+use crate::replay::{self, LogReading};
 
 /// Direction of positive current in a CSV.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
@@ -21,14 +22,15 @@ pub(crate) enum CsvSign {
 }
 
 /// Options for reading logs.
-#[derive(Debug, clap::Args)]
+#[derive(Debug, Default, clap::Args)]
 pub(crate) struct InputArgs {
     /// Stop with an error at the first line that cannot be read
     #[arg(long)]
     pub(crate) strict: bool,
     /// Count a gap longer than this as sleep of the recorder: during the gap, nothing is computed and no frame is made
-    #[arg(long, value_name = "SECONDS", default_value_t = SLEEP_GAP_S, value_parser = positive)]
-    pub(crate) sleep_gap: f64,
+    /// [default: the largest max_age_s of current and voltages, at least 30]
+    #[arg(long, value_name = "SECONDS", value_parser = positive)]
+    pub(crate) sleep_gap: Option<f64>,
     /// Read a channel or interface of a log as this interface, for example 2=can0. CHANNEL is written as in the log. By
     /// default, numbered channels are the configured interfaces in their order
     #[arg(long = "channel", value_name = "CHANNEL=INTERFACE", value_parser = channel)]
@@ -48,16 +50,10 @@ pub(crate) struct InputArgs {
     pub(crate) start_times: Option<PathBuf>,
 }
 
-impl Default for InputArgs {
-    fn default() -> Self {
-        Self {
-            strict: false,
-            sleep_gap: SLEEP_GAP_S,
-            channels: Vec::new(),
-            columns: Vec::new(),
-            csv_sign: None,
-            start_times: None,
-        }
+impl InputArgs {
+    /// Gap that counts as sleep of the recorder (s).
+    pub(crate) fn sleep_gap_s(&self, config: &MonitorConfig) -> f64 {
+        self.sleep_gap.unwrap_or_else(|| replay::sleep_gap_s(config))
     }
 }
 

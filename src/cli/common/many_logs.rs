@@ -48,8 +48,8 @@ impl LogArgs {
         open(&self.input, config, logs)
     }
 
-    /// Gap that counts as sleep of the recorder (s).
-    pub(crate) fn sleep_gap_s(&self) -> f64 {
+    /// Gap that counts as sleep of the recorder (s); `None` = the configuration decides.
+    pub(crate) fn sleep_gap_s(&self) -> Option<f64> {
         self.input.sleep_gap
     }
 

@@ -24,7 +24,7 @@ pub(crate) struct Replayed {
 /// Replays logs as one continuous recording, at full speed and with a progress bar.
 pub(crate) fn replay(logs: &[PathBuf], input: &InputArgs, config: &Config, sinks: Sinks) -> Result<Replayed, Failure> {
     let mut source = LogSource::new(logs.to_owned(), log_options(input, config));
-    let plain = ReplaySettings::plain(input.sleep_gap, config.interface_names());
+    let plain = ReplaySettings::plain(input.sleep_gap_s(&config.monitor), config.interface_names());
     let settings = ReplaySettings { snapshot: true, ..plain };
     let bar = Bar::new(logs);
     let monitor = Monitor::new(config.monitor.clone());

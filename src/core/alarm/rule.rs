@@ -51,6 +51,8 @@ pub enum Rule {
     /// A voltage channel does not show its own cell. The value is 1 in this case, else 0. While the value is 1, the
     /// rules that depend on the cell's voltage are unknown.
     ChannelFaulty = 17,
+    /// A cell's voltage collapses (1), a temperature of the cell rises faster than the current explains (2), or both (3); else 0.
+    ThermalEvent = 18,
 }
 
 /// Scope of a rule: the pack as a whole, its cells, or both.
@@ -125,7 +127,7 @@ pub struct RuleSpec {
 
 impl Rule {
     /// Every rule, in the order of the wire codes.
-    pub const ALL: [Self; 17] = [
+    pub const ALL: [Self; 18] = [
         Self::CapacityLow,
         Self::UsableCapacityLow,
         Self::RechargePeriodLow,
@@ -143,6 +145,7 @@ impl Rule {
         Self::CellLeak,
         Self::ConnectionResistance,
         Self::ChannelFaulty,
+        Self::ThermalEvent,
     ];
 
     /// The rule with a wire code; `None` = no such rule.
@@ -150,9 +153,14 @@ impl Rule {
         Self::ALL.into_iter().find(|rule| *rule as u8 == number)
     }
 
-    /// Formats a value of the rule with its unit. Fractions are shown as percentages.
+    /// Formats a value of the rule with its unit. Fractions are shown as percentages, the evidence of a thermal event in
+    /// words.
     pub fn with_unit(self, value: f64) -> String {
         let unit = self.spec().unit;
+        let evidence = (0_u8..).zip(EVIDENCE).find(|(code, _)| self == Self::ThermalEvent && f64::from(*code) == value);
+        if let Some((_, words)) = evidence {
+            return words.to_owned();
+        }
         match unit {
             Unit::Fraction => format!("{:.1} %", 100.0 * value),
             Unit::FractionPerDay => format!("{:.3} %/d", 100.0 * value),
@@ -182,6 +190,7 @@ impl Rule {
             Self::CellLeak => "cell_leak",
             Self::ConnectionResistance => "connection_resistance",
             Self::ChannelFaulty => "channel_faulty",
+            Self::ThermalEvent => "thermal_event",
         }
     }
 
@@ -229,10 +238,19 @@ impl Rule {
                 (Cell, Above, Fraction, true, true, "a cell's contact resistance in excess of the other cells")
             }
             Self::ChannelFaulty => (Cell, Above, Fraction, false, false, "whether a voltage channel is faulty"),
+            Self::ThermalEvent => (Cell, Above, Ratio, false, false, "the evidence of a thermal event"),
         };
         RuleSpec { scope, direction, unit, has_deviation, is_learned, about }
     }
 }
+
+/// Values of [`Rule::ThermalEvent`] in words.
+const EVIDENCE: [&str; 4] = [
+    "no evidence now",
+    "voltage collapses",
+    "temperature rises faster than the current explains",
+    "voltage collapses and temperature rises",
+];
 
 /// Severity; the values are the wire codes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
@@ -272,6 +290,6 @@ mod tests {
             assert_eq!(Rule::from_number(number), Some(rule));
             assert_eq!(serde_json::to_value(rule).expect("a word"), rule.name());
         }
-        assert_eq!((Rule::from_number(0), Rule::from_number(18)), (None, None));
+        assert_eq!((Rule::from_number(0), Rule::from_number(19)), (None, None));
     }
 }

@@ -126,7 +126,7 @@ impl CellFaultKind {
                 "a soft internal short, moisture or a balancing resistor that stays on: measure the cell's rest voltage \
                            over a week, and replace it when the leak grows"
             }
-            Self::Contact => "tighten and clean the connections of the cell; a loose one heats under load",
+            Self::Contact => "tighten and clean the connections; a loose one heats under load",
             Self::WeakCell => "this cell limits the pack: plan its replacement",
             Self::HighResistance => "the cell has aged more than the others: watch its temperature under load",
             Self::ForeignCell => "the cell has been replaced: balance the pack",
@@ -142,10 +142,12 @@ impl CellFaultKind {
             }
             Self::TemperatureSensor => "the sensor has fallen off or shows one value: check how it is mounted",
             Self::LowCharge => {
-                "the cell ends every discharge early: balance the pack; if the difference stays, compare the channel with a voltmeter"
+                "balance the pack, because a cell with less charge ends a discharge early; if the difference stays, compare the \
+                 channel with a voltmeter"
             }
             Self::HighCharge => {
-                "the cell ends every charge early: balance the pack; if the difference stays, compare the channel with a voltmeter"
+                "balance the pack, because a cell with more charge ends a charge early; if the difference stays, compare the \
+                 channel with a voltmeter"
             }
         }
     }

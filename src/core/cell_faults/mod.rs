@@ -21,6 +21,7 @@
 //! | `channels` | voltage channels that are frozen or show the same cell |
 //! | `temperature` | temperature sensors that do not follow the load |
 //! | [`imbalance`] | charge lost by the differences, and the limiting cells |
+//! | [`thermal_event`] | voltages that collapse and temperatures that rise faster than the current explains |
 //! | [`fault`] | kinds of findings and the limits for reporting them |
 
 pub mod bleed_timer;
@@ -29,6 +30,7 @@ pub mod difference;
 pub mod fault;
 pub mod gain;
 pub mod imbalance;
+pub mod thermal_event;
 
 mod channels;
 mod pack_slope;

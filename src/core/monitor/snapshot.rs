@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::alarm::AlarmChange;
 use crate::cell::Label;
+use crate::cell_faults::thermal_event::ThermalWatch;
 use crate::cell_faults::{CellFaultDetector, Imbalance, UnknownImbalance};
 use crate::filter::ScalarGaussian;
 use crate::health::UseRecord;
@@ -56,6 +57,8 @@ pub struct Snapshot {
     pub(crate) learning: LearningState,
     /// State of the cell-fault detector; `None` if the pack is too small for a comparison.
     pub(crate) diagnosis: Option<CellFaultDetector>,
+    /// State of the watch for a thermal event; `None` without its rule, and in a state for a restart.
+    pub(crate) thermal: Option<ThermalWatch>,
     pub(crate) alarming: StoredAlarming,
     pub(crate) sending: SendingState,
     pub(crate) statistics: Statistics,
@@ -124,6 +127,7 @@ impl Snapshot {
         restarted.estimation.current_check.interrupt();
         restarted.modelling.iter_mut().for_each(ModellingState::restart);
         restarted.diagnosis.iter_mut().for_each(CellFaultDetector::interrupt);
+        restarted.thermal = None;
         restarted.alarming.restart();
         restarted.sending.restart(restarted.time);
         restarted.packs.drop_aside();
@@ -207,6 +211,7 @@ impl Snapshot {
         self.estimation.current_check.check()?;
         self.modelling.iter().try_for_each(ModellingState::check)?;
         self.diagnosis.iter().try_for_each(|diagnosis| diagnosis.check(self.cells.len()))?;
+        self.thermal.iter().try_for_each(ThermalWatch::check)?;
         self.sampling.sampler.check()?;
         self.intake.commands.check_state()?;
         self.packs.check()?;

@@ -86,6 +86,7 @@ impl Stages {
             Channel::SupplyVoltage => return self.sending.handle_supply(now, reading.value),
             _ => {}
         }
+        self.watch_reading(now, &reading, out);
         let sample = self.sampling.handle_reading(now, reading, out);
         if matches!(reading.channel, Channel::Current | Channel::Contactor) {
             self.observe_current(now, self.sampling.sampler.pack_current_a(now), out);
@@ -125,6 +126,7 @@ impl Stages {
     ) {
         match (reading.channel, moment) {
             (Channel::CellVoltage(_) | Channel::PackVoltage, Some(moment)) => {
+                self.watch_reading(now, &reading, out);
                 if let Some(sample) = self.sampling.handle_reading(now, reading, out) {
                     self.handle_sample(now, sample.measured_at(moment), out);
                 }
@@ -383,6 +385,7 @@ impl Stages {
         self.learning.state.load.interrupt();
         self.estimation.bank.change_all(|_, cell| cell.note_sleep());
         self.forget_pack_state();
+        self.findings.interrupt_thermal();
     }
 
     /// Continues at `time` after being asleep.
@@ -409,6 +412,7 @@ impl Stages {
         self.sending.claim_address(time, out);
         self.estimation.handle_unknown_gap();
         self.findings.diagnosis.forget_charge();
+        self.findings.interrupt_thermal();
     }
 
     /// Runs the checks that depend only on time: the ages of the inputs, the minimum duration of the mode, and the

@@ -41,7 +41,9 @@ fn catalogue(has_report: bool) -> Value {
     let row = |(row, shown): (&'static QuantityRow, &'static Presentation)| {
         json!([row.key, row.std_key, row.unit.symbol(), shown.mqtt_name, shown.about])
     };
-    let rules = Rule::ALL.map(|rule| (rule.name().to_owned(), json!(rule.with_unit(1.0))));
+    let rules = Rule::ALL.into_iter().filter(|rule| *rule != Rule::ThermalEvent);
+    let rules = rules.map(|rule| (rule.name().to_owned(), json!(rule.with_unit(1.0))));
+    let thermal_event = [0.0, 1.0, 2.0, 3.0].map(|value| Rule::ThermalEvent.with_unit(value));
     let findings = CellFaultKind::ALL.map(|kind| {
         let size = ScalarGaussian { mean: 1.0, variance: 1.0 };
         let (since, reported) = (Timestamp::ZERO, Timestamp::ZERO);
@@ -53,7 +55,8 @@ fn catalogue(has_report: bool) -> Value {
         "cell": CellValues::rows().map(row).collect::<Vec<_>>(),
         "report": has_report,
         "kept": KEPT.map(|quantity| quantity.row().key),
-        "rules": Value::Object(rules.into_iter().collect()),
+        "rules": Value::Object(rules.collect()),
+        "thermal_event": thermal_event,
         "findings": Value::Object(findings.into_iter().collect()),
     })
 }

@@ -12,8 +12,14 @@ use crate::monitor::MonitorConfig;
 use crate::quantity::BusIndex;
 use crate::sample::VoltageSource;
 
-/// Default sleep gap (s). In a longer gap of a log, the recorder counts as asleep.
-pub const SLEEP_GAP_S: f64 = 30.0;
+/// Shortest default of the sleep gap (s).
+const LEAST_SLEEP_GAP_S: f64 = 30.0;
+
+/// Default sleep gap (s). In a longer gap of a log, the recorder counts as asleep. While a current or a voltage is
+/// fresh, the recorder does not count as asleep.
+pub fn sleep_gap_s(config: &MonitorConfig) -> f64 {
+    LEAST_SLEEP_GAP_S.max(config.sample.current.max_age_s).max(config.sample.voltage.max_age_s)
+}
 
 /// Settings for reading logs.
 #[derive(Debug, Clone, Default, PartialEq)]

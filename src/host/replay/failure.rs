@@ -83,7 +83,8 @@ fn mostly_asleep(span: &RecordSpan) -> Option<String> {
     (2 * gaps > steps && steps > 1).then(|| {
         format!(
             "mostly asleep: {gaps} of {steps} steps between stamps are longer than the sleep gap, so nothing is \
-             computed there; if the recorder was awake, give a longer --sleep-gap"
+             computed there; if the recorder was awake, set max_age_s in [limits.current] and [limits.voltage] to its \
+             longest step, or give a longer --sleep-gap"
         )
     })
 }

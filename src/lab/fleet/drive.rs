@@ -11,8 +11,9 @@ use crate::config::Config;
 use crate::error::LabError;
 use crate::io::log::{LogCounts, LogSource};
 use crate::io::ticks::Ticks;
-use crate::monitor::{Monitor, Outputs, Record, RecordKind, TICK_PERIOD_MS};
+use crate::monitor::{Monitor, MonitorConfig, Outputs, Record, RecordKind, TICK_PERIOD_MS};
 use crate::quantity::Timestamp;
+use crate::replay::sleep_gap_s;
 
 /// An opened log, and a note for the user on how it is read.
 pub type OpenedLog = (LogSource, Option<String>);
@@ -22,8 +23,15 @@ pub type OpenedLog = (LogSource, Option<String>);
 pub struct LogAccess<'a> {
     /// Opens logs with a configuration. The logs are read one after the other, as one recording.
     pub open: &'a (dyn Fn(&Config, &[PathBuf]) -> OpenedLog + Sync),
-    /// Longest gap in a log (s) before the recorder counts as asleep.
-    pub sleep_gap_s: f64,
+    /// Longest gap in a log (s) before the recorder counts as asleep; `None` = the configuration decides.
+    pub sleep_gap_s: Option<f64>,
+}
+
+impl LogAccess<'_> {
+    /// Sleep gap with a configuration (s).
+    pub(super) fn sleep_gap_of_s(&self, config: &MonitorConfig) -> f64 {
+        self.sleep_gap_s.unwrap_or_else(|| sleep_gap_s(config))
+    }
 }
 
 /// Summary of a replayed log.

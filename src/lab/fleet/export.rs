@@ -138,7 +138,7 @@ pub(super) fn export(
         result
     };
     let monitor = Monitor::new(config.monitor.clone());
-    let driven = drive(source, monitor, out, settings.access.sleep_gap_s, &mut each, report)?;
+    let driven = drive(source, monitor, out, settings.access.sleep_gap_of_s(&config.monitor), &mut each, report)?;
     let span = driven.span_of(&log)?;
     let metadata = metadata(config, &log, span, settings);
     let mut notes = driven.notes.clone();

@@ -168,7 +168,8 @@ fn replay(
         out.clear();
         Ok(())
     };
-    let driven = drive(source, Monitor::new(monitor.clone()), out, settings.access.sleep_gap_s, &mut each, report)?;
+    let driven =
+        drive(source, Monitor::new(monitor.clone()), out, settings.access.sleep_gap_of_s(monitor), &mut each, report)?;
     Ok(ReplayResult { driven, track, batch, truth })
 }
 

@@ -1,6 +1,6 @@
 //! Lists what is known about the battery, as named figures, and what is not known: why, and what would teach it.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 use super::context::PageContext;
 use super::data::{Data, Origin};
@@ -68,8 +68,7 @@ impl Knowledge {
         if let Some(cycles) = series::full_cycles(data, rated_ah) {
             known.tile("Use so far", format!("{cycles:.0} cycles"), "equivalent full cycles in this record");
         }
-        let in_all = data.alarms.iter().filter(|row| row.change == "raised").count();
-        known.tile("Alarms raised now", raised.len().to_string(), format!("{in_all} raised in this record"));
+        known.tile("Alarms raised now", raised.len().to_string(), raised_before(data));
         known.model(data, context);
         known
     }
@@ -98,7 +97,7 @@ impl Knowledge {
         match context.rated_ah(step.cell) {
             Some(rated) => self.tile(
                 "State of health",
-                format!("{:.0} %", 100.0 * step.worst.0 / rated),
+                format!("{:.1} \u{b1} {:.1} %", 100.0 * step.worst.0 / rated, 100.0 * step.worst.1 / rated),
                 format!("of {rated} Ah rated{}{}", of_cell(data, &step), assumed(measured, &step)),
             ),
             None => self.gap(
@@ -260,6 +259,18 @@ fn teaches_by_label(context: &PageContext<'_>) -> String {
     let lfp = " An LFP cell must be nearly empty at one end and nearly full at the other.";
     let is_flat = !is_learnable(context);
     format!("A discharge and a charge of more than a quarter of the capacity.{}", if is_flat { lfp } else { "" })
+}
+
+/// Says which alarms were raised in the record, and how often. Alarms of several cells at the same time count once.
+fn raised_before(data: &Data) -> String {
+    let mut times: BTreeMap<&str, BTreeSet<i64>> = BTreeMap::new();
+    for row in data.alarms.iter().filter(|row| row.change == "raised") {
+        times.entry(&row.rule).or_default().insert((row.time_s / 60.0) as i64);
+    }
+    let plural = |count: usize| if count == 1 { "" } else { "s" };
+    let often = times.iter().map(|(rule, times)| format!("{rule} at {} time{}", times.len(), plural(times.len())));
+    let often: Vec<String> = often.collect();
+    if often.is_empty() { "none in this record".to_owned() } else { format!("in this record: {}", often.join(", ")) }
 }
 
 fn last(data: &Data, pick: series::ValueSelector, high_is_bad: bool) -> Option<CellStep> {

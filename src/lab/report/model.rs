@@ -69,7 +69,7 @@ pub(super) fn advice(context: &PageContext<'_>) -> Option<Vec<String>> {
 
 /// A measurement, and the error of the SOC that remains after it.
 pub(super) fn sentence(advice: &crate::cell::Advice) -> String {
-    format!("{}: {:.1} points remain", advice.measurement, advice.left_points)
+    format!("{} (error then: {:.1} points)", advice.measurement, advice.left_points)
 }
 
 fn curve(bands: &ModelBands<'_>) -> String {
@@ -161,7 +161,7 @@ mod tests {
         assert_eq!(value("Range of this record"), "10 % of the SOC (50 to 60 %), 20 to 30 \u{b0}C");
         assert!(value("State").starts_with("label only"));
         let advice = advice(&context).expect("known");
-        assert!(!advice.is_empty() && advice[0].contains("points remain"), "{advice:?}");
+        assert!(!advice.is_empty() && advice[0].contains("error then"), "{advice:?}");
     }
 
     #[test]

@@ -15,7 +15,7 @@ use super::series;
 use super::summary::Condition;
 use crate::alarm::{Direction, Rule};
 use crate::cell_faults::{CellFault, CellFaultKind, Imbalance};
-use crate::quantity::CellIndex;
+use crate::quantity::{CellIndex, DAY_S};
 
 /// From this loss on, the pack counts as out of balance, fraction of its charge. Two standard deviations below the
 /// estimated loss must reach it.
@@ -23,7 +23,7 @@ const OUT_OF_BALANCE: f64 = 0.03;
 /// A contact that is found within this part of the record counts as high from the beginning. Finding it takes days.
 const BEGINNING: f64 = 0.25;
 /// Time after which a contact that has not grown counts as steady (s).
-const STEADY_S: f64 = 7.0 * 86_400.0;
+const STEADY_S: f64 = 7.0 * DAY_S;
 
 /// Kinds of findings about cells, in the order of the page. Other kinds follow; they are about sensors.
 const CELL_KINDS: [CellFaultKind; 8] = [
@@ -47,6 +47,8 @@ pub(super) struct Problem {
     pub(super) advice: String,
     /// Alarms and dates, as sentences.
     pub(super) note: String,
+    /// Whether an alarm is raised about it.
+    pub(super) is_alarm: bool,
 }
 
 impl Problem {
@@ -54,6 +56,7 @@ impl Problem {
     fn add_alarms(&mut self, alarms: &[&ActiveAlarm<'_>], data: &Data) {
         self.condition = alarms.iter().map(|alarm| condition_of(&alarm.row.severity)).fold(self.condition, Ord::max);
         self.note = format!("{}{}", self.note, alarm_notes(alarms, data)).trim_start().to_owned();
+        self.is_alarm |= !alarms.is_empty();
     }
 }
 
@@ -66,9 +69,10 @@ pub(super) fn problems(data: &Data, context: &PageContext<'_>, outlook: Option<&
         what: format!("The figures may be wrong: {doubt}."),
         advice: "Do not rely on them.".to_owned(),
         note: String::new(),
+        is_alarm: false,
     }));
-    // A stable sort: problems of the same condition keep their order.
-    problems.sort_by_key(|problem| std::cmp::Reverse(problem.condition));
+    // A stable sort: problems of the same condition keep their order, those with a raised alarm first.
+    problems.sort_by_key(|problem| std::cmp::Reverse((problem.condition, problem.is_alarm)));
     problems
 }
 
@@ -89,7 +93,8 @@ fn of_battery(
     let mut of_charge = groups.iter().position(|group| is_charge(group[0].kind));
     if let Some((pack, at)) = imbalance.zip(of_charge) {
         let (mean, std) = percent(pack);
-        problems[at].what += &format!(" The pack loses {mean:.1} \u{b1} {std:.1} % of its charge by imbalance.");
+        problems[at].what +=
+            &format!(" Because of imbalance, {mean:.1} \u{b1} {std:.1} % of the pack's capacity cannot be used.");
     } else if let Some(pack) = imbalance.filter(|pack| is_unbalanced(pack)) {
         of_charge = Some(problems.len());
         problems.push(unbalanced(pack, findings.is_empty()));
@@ -104,7 +109,7 @@ fn of_battery(
         Some(rule) => findings.iter().any(|found| explains(found, rule, alarm.row.cell)),
         None => false,
     };
-    let no_limit = if raised.is_empty() { ", but no limit is exceeded" } else { "" };
+    let no_limit = if raised.is_empty() { ", but no alarm is raised" } else { "" };
     let is_capacity_low = raised.iter().any(|alarm| rule(&alarm.row.rule) == Some(Rule::CapacityLow));
     let open: Vec<ActiveAlarm<'_>> = raised.into_iter().filter(|alarm| !is_explained(alarm)).collect();
     problems.extend(grouped(&open).iter().map(|group| alarm(group, data, context, outlook)));
@@ -114,6 +119,7 @@ fn of_battery(
             what: format!("The capacity is below the end of life{no_limit}."),
             advice: "Plan its replacement.".to_owned(),
             note: String::new(),
+            is_alarm: false,
         });
     }
     problems
@@ -183,15 +189,17 @@ fn finding(group: &[&CellFault], raised: &[ActiveAlarm<'_>], data: &Data) -> Pro
         what: sentence(kind, &subject, numbers.len() > 1, &sizes(group)) + growth.map_or("", Growth::words),
         advice: growth.and_then(Growth::advice).map_or_else(|| capitalised(kind.advice()) + ".", str::to_owned),
         note: format!("Found {}.{}", moment(data, found_s), alarm_notes(&alarms, data)),
+        is_alarm: !alarms.is_empty(),
     }
 }
 
-/// One sentence per rule and severity: since when which alarm is raised.
+/// One sentence per rule, severity and date: since when which alarm is raised.
 fn alarm_notes(alarms: &[&ActiveAlarm<'_>], data: &Data) -> String {
+    let day = |since_s: f64| (since_s / DAY_S).floor();
     let mut notes: Vec<((&str, &str), f64, Vec<usize>)> = Vec::new();
     for alarm in alarms {
         let key = (alarm.row.rule.as_str(), alarm.row.severity.as_str());
-        match notes.iter_mut().find(|note| note.0 == key) {
+        match notes.iter_mut().find(|note| note.0 == key && day(note.1) == day(alarm.since_s)) {
             Some((_, since_s, numbers)) => {
                 *since_s = since_s.min(alarm.since_s);
                 numbers.extend(alarm.row.cell);
@@ -329,18 +337,19 @@ fn is_unbalanced(pack: &Imbalance) -> bool {
 fn unbalanced(pack: &Imbalance, is_only: bool) -> Problem {
     let (mean, std) = percent(pack);
     let [empty, full] = [&pack.discharge_limit, &pack.charge_limit].map(|limit| limit.cell.index() + 1);
-    let no_other = if is_only { " No single cell is failing." } else { "" };
+    let no_other = if is_only { " No failing cell was found." } else { "" };
     Problem {
         condition: Condition::Plan,
         what: format!(
-            "The pack is out of balance: it loses {mean:.1} \u{b1} {std:.1} % of its charge. Cell {empty} is empty first, \
+            "The pack is out of balance: {mean:.1} \u{b1} {std:.1} % of its capacity cannot be used. Cell {empty} is empty first, \
              and cell {full} is full first.{no_other}"
         ),
         advice:
-            "Balance the pack: this restores the lost charge. Then create the report again: a cell that drifts away \
-                 again is failing."
+            "Balance the pack: this restores the lost capacity. Then create the report again: if a cell drifts away \
+                 again, it is failing."
                 .to_owned(),
         note: String::new(),
+        is_alarm: false,
     }
 }
 
@@ -355,6 +364,7 @@ fn alarm(group: &AlarmGroup<'_>, data: &Data, context: &PageContext<'_>, outlook
         what: alarm_sentence(group, data, context, outlook),
         advice: rule.map_or("Read the manual of this alarm.", |rule| alarm_advice(rule, condition)).to_owned(),
         note: alarm_notes(&group.alarms, data).trim_start().to_owned(),
+        is_alarm: true,
     }
 }
 
@@ -370,6 +380,7 @@ fn alarm_sentence(group: &AlarmGroup<'_>, data: &Data, context: &PageContext<'_>
         Rule::InputMissing => return format!("Readings of {whose} are missing."),
         Rule::InputImplausible => return format!("Readings of {whose} are implausible."),
         Rule::ChannelFaulty => return format!("The voltage channel of {whose} does not show its cell."),
+        Rule::ThermalEvent => return format!("The readings of {whose} show a thermal event{}.", evidence(group)),
         _ => {}
     }
     let spec = rule.spec();
@@ -398,6 +409,14 @@ fn alarm_sentence(group: &AlarmGroup<'_>, data: &Data, context: &PageContext<'_>
     }
 }
 
+/// The evidence with which alarms of a thermal event were raised, in words.
+fn evidence(group: &AlarmGroup<'_>) -> String {
+    let values: Vec<f64> = group.alarms.iter().filter_map(|alarm| alarm.row.value).collect();
+    let has = |kind: u8| values.iter().any(|value| *value as u8 & kind != 0);
+    let value = u8::from(has(1)) + 2 * u8::from(has(2));
+    if value == 0 { String::new() } else { format!(": {}", Rule::ThermalEvent.with_unit(f64::from(value))) }
+}
+
 fn condition_of(severity: &str) -> Condition {
     [Condition::Watch, Condition::Plan, Condition::Act][rank(severity).min(2)]
 }
@@ -418,6 +437,10 @@ const fn concerns_measurement(rule: Rule) -> bool {
 
 const fn alarm_advice(rule: Rule, condition: Condition) -> &'static str {
     match rule {
+        Rule::ThermalEvent => {
+            "Leave the vehicle, keep people away, and call the fire brigade. Do not charge or drive it again before the \
+             named cell has been examined."
+        }
         Rule::TemperatureHigh => "Check cooling and load before the next use.",
         Rule::SocLow => "Charge it.",
         Rule::CellImbalance => "Have the cells balanced; if the imbalance returns, have the weakest cell checked.",

@@ -63,12 +63,13 @@ pub(super) fn of(data: &Data, context: &PageContext<'_>, outlook: &Result<Outloo
 /// Says that nothing is wrong, and how far this is known.
 fn no_problem(data: &Data, context: &PageContext<'_>, knowledge: &Knowledge) -> Problem {
     let compared = context.imbalance.as_ref().and_then(|pack| pack.as_ref().ok()).map(|pack| pack.cells);
-    let limits = if knows_limits(data, context) { " No limit is exceeded." } else { "" };
+    let limits = if knows_limits(data, context) { " No alarm is raised." } else { "" };
     let say = |condition, what: String, advice: &str| Problem {
         condition,
         what,
         advice: advice.to_owned(),
         note: String::new(),
+        is_alarm: false,
     };
     let measured = knowledge.measured_cells;
     let all = context.config.map_or(0, |config| usize::from(config.monitor.sample.cells)).max(data.cells());

@@ -93,7 +93,7 @@ class Monitor:
         rated_ah: float | None = None,
         voltage_min_v: float | None = None,
         voltage_max_v: float | None = None,
-        sleep_gap_s: float = 30.0,
+        sleep_gap_s: float | None = None,
         estimates_period_s: float | None = 0.0,
     ) -> Monitor: ...
     @property
@@ -274,7 +274,7 @@ def replay(
     csv_sign: Literal["discharge", "charge"] | None = None,
     start_times: _Path | None = None,
     strict: bool = False,
-    sleep_gap_s: float = 30.0,
+    sleep_gap_s: float | None = None,
     estimates_period_s: float | None = 0.0,
     progress: bool = False,
 ) -> Replay:

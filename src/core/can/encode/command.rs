@@ -208,7 +208,7 @@ mod tests {
             ([0, 31, 0, 2047], "Command", 0),
             ([4, 31, 0, 2047], "Command", 4),
             ([1, 0, 0, 2047], "Rule", 0),
-            ([1, 18, 0, 2047], "Rule", 18),
+            ([1, 19, 0, 2047], "Rule", 19),
             ([1, 31, 0, 1024], "Cell", 1024),
         ] {
             assert_eq!(plan().decode(&frame(codes)), Err(CommandFault::meaningless(signal, code)));

@@ -17,7 +17,7 @@ pub struct PlanFaults(pub Vec<String>);
 
 /// The alarm rules in the order of their numbers, which start at 1. Each rule has its own `Value_...` and
 /// `Threshold_...` signals, because the units of the rules differ.
-pub(super) const RULES: [&str; 17] = [
+pub(super) const RULES: [&str; 18] = [
     "CapacityLow",
     "UsableCapacityLow",
     "RechargePeriodLow",
@@ -35,6 +35,7 @@ pub(super) const RULES: [&str; 17] = [
     "CellLeak",
     "ConnectionResistance",
     "ChannelFaulty",
+    "ThermalEvent",
 ];
 
 #[derive(Debug, Clone, PartialEq)]

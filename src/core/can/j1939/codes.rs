@@ -13,8 +13,8 @@ use serde::{Deserialize, Serialize};
 use super::trouble_code::{Lamp, Lamps, TroubleCode};
 use crate::quantity::Timestamp;
 
-/// Maximum number of codes whose state is followed. It is more than a configuration can have (17 rules with three
-/// severities give 51) and small enough for a linear search.
+/// Maximum number of codes whose state is followed. It is more than a configuration can have (18 rules with three
+/// severities give 54) and small enough for a linear search.
 const MAX_FOLLOWED: usize = 64;
 
 /// An active code and its lamp.

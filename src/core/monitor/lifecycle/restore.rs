@@ -39,6 +39,7 @@ impl Monitor {
             modelling: modelling.stored(),
             learning: learning.state.clone(),
             diagnosis: findings.stored(),
+            thermal: findings.stored_thermal(),
             alarming: alarming.snapshot(),
             sending: sending.snapshot(),
             statistics: statistics.clone(),
@@ -141,6 +142,7 @@ impl Stages {
         self.estimation.current_check = snapshot.estimation.current_check;
         self.restore_learned(&snapshot.cells, snapshot.modelling, snapshot.learning, batch);
         self.findings.restore(snapshot.diagnosis, (!is_continued).then_some((snapshot.time, now)));
+        self.findings.restore_thermal(snapshot.thermal);
         self.note_faulty_channels();
         self.sampling.restore(snapshot.sampling);
         self.packs = snapshot.packs;

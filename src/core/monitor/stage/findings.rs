@@ -2,17 +2,21 @@
 //!
 //! In: the samples of all cells with their estimates. Out: an event for each new finding ([`EventKind::Finding`]). The
 //! stage only observes: estimates and capacities do not depend on findings. When a row of the detector (a few minutes
-//! of samples) ends, the results of the row go to the alarm rules about single cells.
+//! of samples) ends, the results of the row go to the alarm rules about single cells. If the rule `thermal_event` is
+//! configured, the stage also watches the readings for a thermal event.
 
 use super::estimation::Estimation;
 use super::learning::Learning;
+use super::sampling::Sampling;
+use crate::alarm::Rule;
 use crate::cell_faults::fault::OFFSET_PER_H;
 use crate::cell_faults::gain::CellAgeing;
+use crate::cell_faults::thermal_event::ThermalWatch;
 use crate::cell_faults::{BalancingConfig, CellFaultDetector, CellFaultKind, MeanCell};
 use crate::filter::{ScalarGaussian, probability_below};
 use crate::monitor::config::MonitorConfig;
 use crate::monitor::message::{Event, EventKind, Outputs};
-use crate::quantity::{CellIndex, Fault, Timestamp};
+use crate::quantity::{CellIndex, Channel, Fault, Reading, Timestamp};
 use crate::sample::CellSample;
 
 /// The findings stage.
@@ -27,6 +31,8 @@ pub(crate) struct Findings {
     is_balanced: bool,
     /// Meaning of the balancing bits; `None` without balancing bits.
     balancing: Option<BalancingConfig>,
+    /// `None` without the rule `thermal_event`.
+    thermal: Option<ThermalWatch>,
 }
 
 impl Findings {
@@ -34,18 +40,82 @@ impl Findings {
     pub(crate) fn new(config: &MonitorConfig, compared: &[usize]) -> Self {
         let cells = usize::from(config.sample.cells);
         let (is_balanced, balancing) = (config.is_balanced, config.balancing);
-        let compared = compared.to_vec();
-        Self { diagnosis: CellFaultDetector::among(cells, &compared), cells, compared, is_balanced, balancing }
+        let (compared, diagnosis) = (compared.to_vec(), CellFaultDetector::among(cells, compared));
+        let thermal = thermal_watch(config);
+        Self { diagnosis, cells, compared, is_balanced, balancing, thermal }
     }
 
     /// Applies the settings of a new configuration that has the same cells.
     pub(crate) fn reconfigure(&mut self, config: &MonitorConfig) {
         (self.is_balanced, self.balancing) = (config.is_balanced, config.balancing);
+        let new = thermal_watch(config);
+        self.thermal = new.map(|new| self.thermal.take().unwrap_or(new));
     }
 
     /// Forgets everything, because another pack is connected.
     pub(crate) fn forget(&mut self) {
         self.diagnosis = CellFaultDetector::among(self.cells, &self.compared);
+        self.interrupt_thermal();
+    }
+
+    /// Handles a break in the readings: a rise or fall across the break is no thermal event.
+    pub(crate) fn interrupt_thermal(&mut self) {
+        self.thermal.iter_mut().for_each(ThermalWatch::interrupt);
+    }
+
+    /// State of the watch for a thermal event, to be stored.
+    pub(crate) fn stored_thermal(&self) -> Option<ThermalWatch> {
+        self.thermal.clone()
+    }
+
+    /// Restores a checked watch, unless the configuration has changed.
+    pub(crate) fn restore_thermal(&mut self, stored: Option<ThermalWatch>) {
+        if let (Some(thermal), Some(stored)) = (&mut self.thermal, stored)
+            && stored.fits(thermal)
+        {
+            *thermal = stored;
+        }
+    }
+
+    /// Watches a reading, plausible or not, for a thermal event. Returns the cell and its evidence if the evidence is
+    /// new.
+    #[inline]
+    pub(crate) fn watch_reading(
+        &mut self,
+        now: Timestamp,
+        reading: &Reading,
+        (sampling, estimation): (&Sampling, &Estimation),
+    ) -> Option<(CellIndex, f64)> {
+        let (thermal, value) = (self.thermal.as_mut()?, reading.value.ok()?);
+        let cell = match reading.channel {
+            Channel::CellVoltage(cell) => {
+                let rate_per_h = || rate_per_h(now, cell.index(), sampling, estimation);
+                thermal.handle_voltage(now, cell, value, rate_per_h).then_some(cell)
+            }
+            Channel::Temperature(sensor) => {
+                let sensors = &sampling.sampler.config().sensor_of_cell;
+                let measures = |cell: usize| sensors.get(cell) == Some(&Some(sensor));
+                let first = (0..sensors.len()).find(|&cell| measures(cell))?;
+                let rate_per_h = rate_per_h(now, first, sampling, estimation);
+                thermal.handle_temperature(now, sensor, value, rate_per_h, measures)
+            }
+            _ => None,
+        }?;
+        Some((cell, thermal.evidence_of(now, cell)))
+    }
+
+    /// Refreshes the watch for a thermal event if this is due. If so, returns the evidence for each cell.
+    pub(crate) fn refresh_thermal(
+        &mut self,
+        now: Timestamp,
+        (sampling, estimation): (&Sampling, &Estimation),
+    ) -> Vec<(CellIndex, Option<f64>)> {
+        let Some(thermal) = &mut self.thermal else { return Vec::new() };
+        let least_soc = |cell: usize| estimation.bank.soc(cell).map(|soc| soc.mean - 2.0 * soc.std());
+        if !thermal.refresh(now, rate_per_h(now, 0, sampling, estimation), least_soc) {
+            return Vec::new();
+        }
+        thermal.evidence(now, &sampling.sampler.config().sensor_of_cell).collect()
     }
 
     /// The state to be stored; `None` if the pack is too small for a comparison.
@@ -140,6 +210,18 @@ impl Findings {
         }
         is_complete
     }
+}
+
+/// Current of a cell relative to its rated capacity (1/h); `None` = unknown.
+fn rate_per_h(now: Timestamp, cell: usize, sampling: &Sampling, estimation: &Estimation) -> Option<f64> {
+    Some(sampling.sampler.cell_current_a(now)? / estimation.bank.model(cell).rated_capacity_ah)
+}
+
+/// Creates the watch if the rule `thermal_event` is configured.
+fn thermal_watch(config: &MonitorConfig) -> Option<ThermalWatch> {
+    let is_wanted = config.rules.iter().any(|rule| rule.rule == Rule::ThermalEvent);
+    let sensors = config.sample.sensor_of_cell.iter().flatten().map(|sensor| sensor.index() + 1).max().unwrap_or(0);
+    is_wanted.then(|| ThermalWatch::new(usize::from(config.sample.cells), sensors))
 }
 
 /// Probability that the current sensor's offset is larger than [`OFFSET_PER_H`], and the learned offset as a fraction

@@ -13,7 +13,7 @@ use crate::monitor::message::{EventKind, Outputs};
 use crate::monitor::stage::alarming::take_show_due;
 use crate::monitor::stage::estimation::Estimation;
 use crate::monitor::stage::publisher::learned;
-use crate::quantity::{CellIndex, Channel, Timestamp};
+use crate::quantity::{CellIndex, Channel, Reading, Timestamp};
 use crate::sample::CellSample;
 
 /// Rules about learned values of a cell.
@@ -61,6 +61,22 @@ impl Stages {
         self.watch_inputs(now, worst, out);
         self.watch_learned(now, any_lost, out);
         self.watch_pack(now, worst.is_some() && !any_lost, out);
+        self.refresh_thermal(now, out);
+    }
+
+    /// Watches a reading for a thermal event, and passes new evidence to its rule at once.
+    #[inline]
+    pub(crate) fn watch_reading(&mut self, now: Timestamp, reading: &Reading, out: &mut Outputs) {
+        if let Some((cell, evidence)) = self.findings.watch_reading(now, reading, (&self.sampling, &self.estimation)) {
+            self.publisher(now, out).observe(Rule::ThermalEvent, Some(cell), Observation::new(Some(evidence)));
+        }
+    }
+
+    /// Passes the evidence of a thermal event of every cell to its rule, every half minute.
+    fn refresh_thermal(&mut self, now: Timestamp, out: &mut Outputs) {
+        for (cell, evidence) in self.findings.refresh_thermal(now, (&self.sampling, &self.estimation)) {
+            self.publisher(now, out).observe(Rule::ThermalEvent, Some(cell), Observation::new(evidence));
+        }
     }
 
     /// Passes values about interfaces and files to their rules, and publishes all alarms.

@@ -89,7 +89,7 @@ impl Alarm {
                 when: self.when,
                 debounce_s: self.debounce_s,
                 debounce_events: self.debounce_events,
-                is_latching: self.latched,
+                is_latching: self.latched.unwrap_or(self.rule == Rule::ThermalEvent),
             })
         };
         self.thresholds().filter_map(rule).collect()
@@ -144,6 +144,9 @@ fn check_needs(alarm: &Alarm, raw: &RawTables) {
         Rule::CellImbalance if cells < 2 => "requires the voltages of at least two cells",
         Rule::CellLeak | Rule::ConnectionResistance | Rule::ChannelFaulty if cells < 3 => {
             "requires the voltages of at least three cells"
+        }
+        Rule::ThermalEvent if cells < 3 && raw.temperatures.is_empty() && !raw.broken => {
+            "requires the voltages of at least three cells or an [[input.temperature]]"
         }
         Rule::BmsDisagrees if !is_reported => "requires [input.reported_soc] or [input.reported_soh]",
         _ => "",

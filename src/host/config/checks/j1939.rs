@@ -106,7 +106,7 @@ fn failure_mode(rule: Rule, severity: Severity) -> u8 {
         Rule::InputMissing => 9,
         Rule::BusFault => 19,
         Rule::InputImplausible | Rule::BmsDisagrees | Rule::ChannelFaulty => 2,
-        Rule::EstimateUntrusted | Rule::StoreFailed => 31,
+        Rule::EstimateUntrusted | Rule::StoreFailed | Rule::ThermalEvent => 31,
         Rule::CapacityLow
         | Rule::UsableCapacityLow
         | Rule::RechargePeriodLow

@@ -231,7 +231,7 @@ fn alarms_of_96_cells_are_one_problem() {
     assert_eq!(first, "The capacity of cells 1 to 96 was below the limit of 1.82 Ah; now it is 2.147 Ah in cell 96.");
     assert!(raised.contains("Alarm capacity_low (warning) of cells 1 to 96 since"));
     let count = cards(&raised).into_iter().find(|card| card.name == "Alarms raised now").expect("a card");
-    assert_eq!(count.text, "96; 96 raised in this record");
+    assert_eq!(count.text, "96; in this record: capacity_low at 1 time");
 }
 
 /// Numbers after the plus-minus signs, each with half a unit of its last digit.
@@ -270,6 +270,7 @@ fn every_plus_minus_is_one_standard_deviation() {
     let [lithium, negative, positive] = [second.losses[0], third.losses[1], first.losses[2]].map(|std| 100.0 * std);
     for card in cards(&page) {
         let expected = match card.name {
+            "State of health" => vec![100.0 * last.capacity_ah / 2.6],
             "Capacity" => vec![last.capacity_ah],
             "Usable capacity" => vec![first.usable_ah],
             "Lithium lost" => vec![lithium, negative, positive],
@@ -280,8 +281,8 @@ fn every_plus_minus_is_one_standard_deviation() {
     }
     let offset = between(&page, "reading minus true current</td><td>", "</td>").expect("a row");
     assert!(states(offset, &[0.034]), "{offset}");
-    // The page has only these plus-minus signs: one in the statement, six on cards, one for the offset.
-    assert_eq!(page.matches(PLUS_MINUS).count(), 8);
+    // The page has only these plus-minus signs: one in the statement, seven on cards, one for the offset.
+    assert_eq!(page.matches(PLUS_MINUS).count(), 9);
     assert!(!page.contains("+-"), "another plus-minus sign");
 }
 

@@ -49,7 +49,7 @@ fn cells_of_one_kind_are_one_problem_with_numbers_from_1() {
     let problems = list(&low, &record(&[], 0.0));
     assert_eq!(problems.len(), 1, "{problems:?}");
     assert_eq!(problems[0].what, "Cells 2 and 81 have 2.7 to 2.9 points less charge than the others.");
-    assert!(problems[0].advice.starts_with("The cell ends every discharge early: balance the pack"));
+    assert!(problems[0].advice.starts_with("Balance the pack, because a cell with less charge ends a discharge early"));
     let leak = list(&[found(CellFaultKind::Leak, 81, 0.013, 1.0)], &record(&[], 0.0));
     assert_eq!(leak[0].what, "Cell 82 loses 1.30 \u{b1} 2.00 % of the capacity per day without a load.");
 }
@@ -129,8 +129,8 @@ fn pack_out_of_balance_is_named_without_a_failing_cell() {
         of_battery(findings, data, &context, None)
     };
     let mut data = record(&[], 0.0);
-    let text = "The pack is out of balance: it loses 5.7 \u{b1} 0.8 % of its charge. Cell 10 is empty first, and cell 91 is full \
-                first. No single cell is failing.";
+    let text = "The pack is out of balance: 5.7 \u{b1} 0.8 % of its capacity cannot be used. Cell 10 is empty first, and cell 91 \
+                is full first. No failing cell was found.";
     assert_eq!(of(0.057, &[], &data)[0].what, text);
     assert_eq!(of(0.04, &[], &data), [], "within two standard deviations of the limit");
     data.alarms.push(alarm("cell_imbalance", "severe", None));
@@ -142,7 +142,7 @@ fn pack_out_of_balance_is_named_without_a_failing_cell() {
     let with_cost = of(0.057, &low, &data);
     assert_eq!(with_cost.len(), 1);
     assert!(
-        with_cost[0].what.ends_with("The pack loses 5.7 \u{b1} 0.8 % of its charge by imbalance."),
+        with_cost[0].what.ends_with("Because of imbalance, 5.7 \u{b1} 0.8 % of the pack's capacity cannot be used."),
         "{with_cost:?}"
     );
 }
@@ -167,7 +167,7 @@ fn end_of_life_is_listed_unless_capacity_low_is_raised() {
         let what = list(&[], &data).into_iter().map(|problem| problem.what);
         what.filter(|what| what.contains("end of life")).collect::<Vec<String>>()
     };
-    assert_eq!(said(&[]), ["The capacity is below the end of life, but no limit is exceeded."]);
+    assert_eq!(said(&[]), ["The capacity is below the end of life, but no alarm is raised."]);
     let text = "The capacity is below the end of life.";
     for severity in ["info", "severe"] {
         assert_eq!(said(&[alarm("temperature_high", severity, None)]), [text], "{severity}");

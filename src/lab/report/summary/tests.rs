@@ -69,13 +69,13 @@ fn good_needs_every_cell_and_a_limit() {
     let good = of(&[cell(0), cell(1)], vec![limit(1.0)], None);
     assert_eq!(
         (good.condition, good.problems[0].what.as_str()),
-        (Condition::Good, "Nothing is wrong. No limit is exceeded.")
+        (Condition::Good, "Nothing is wrong. No alarm is raised.")
     );
     let no_limit = of(&[cell(0), cell(1)], Vec::new(), None);
     assert_eq!(no_limit.condition, Condition::Unknown);
     assert!(no_limit.problems[0].what.contains("states no limit") && no_limit.problems[0].advice.contains("-c"));
     let one_missing = of(&[cell(1)], vec![limit(1.0)], None);
-    let text = "Unknown: nothing has been learned yet about 1 of 2 cells. No limit is exceeded.";
+    let text = "Unknown: nothing has been learned yet about 1 of 2 cells. No alarm is raised.";
     assert_eq!(one_missing.problems[0].what, text);
     assert_eq!(of(&[cell(0), learned(3.0, 1, None)], vec![limit(1.0)], None).condition, Condition::Unknown);
     // The capacity is below the end of life, although no alarm is raised.

@@ -39,6 +39,7 @@ fn every_page_decodes_to_its_values() {
         ("Rule_CellLeak", 1.0),
         ("Rule_ConnectionResistance", 5.0),
         ("Rule_ChannelFaulty", 3.0),
+        ("Rule_ThermalEvent", 5.0),
         ("ThresholdRule", 14.0),
         ("ThresholdSeverity", 3.0),
         ("Threshold", 1.0),

@@ -21,7 +21,7 @@ use crate::quantity::{CellIndex, Timestamp};
 const BURST: i64 = 20;
 /// Shortest time between frames in turn, in units of [`ALARM_DELAY_MS`]. Half of the budget thus remains for changes.
 const TURN_DELAYS: u32 = 2;
-/// Maximum number of alarms that are announced as unknown. 17 rules with three severities have 51 thresholds. Further
+/// Maximum number of alarms that are announced as unknown. 18 rules with three severities have 54 thresholds. Further
 /// unknown alarms are not announced, but the digest shows their rules as unknown.
 const MAX_UNKNOWN: usize = 64;
 

@@ -97,4 +97,5 @@ choice!(Rule {
     "cell_leak" => Self::CellLeak,
     "connection_resistance" => Self::ConnectionResistance,
     "channel_faulty" => Self::ChannelFaulty,
+    "thermal_event" => Self::ThermalEvent,
 });

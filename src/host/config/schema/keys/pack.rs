@@ -90,6 +90,7 @@ section! {
     /// `temperature_high`: temperature of the hottest sensor (degrees C). `remaining_life_low`: remaining life, equivalent full cycles.
     /// `input_missing`, `store_failed` and `bus_fault`: how long the fault has lasted (s). `estimate_untrusted`: the mean normalised innovation squared, or the cell model's mismatch on the same scale.
     /// Three rules compare each cell with the other cells. `cell_leak`: self-discharge per day as a fraction of the cell's capacity. `connection_resistance`: additional contact resistance as a fraction of the cell's series resistance at 50 % SOC and 25 degrees C. `channel_faulty`: 1 while the cell's voltage channel is faulty (frozen, offset, doubled or swapped), else 0.
+    /// `thermal_event`: 1 if the voltage of a cell collapses, 2 if a temperature of the cell rises faster than the current explains, 3 if both, else 0.
     Alarm at "alarm" {
         /// What the alarm compares.
         rule: Rule, "", Any, Required;
@@ -108,10 +109,10 @@ section! {
         /// Number of consecutive new values that must agree before the alarm is raised or cleared.
         debounce_events: u32, "", Between(1.0, 1e6), Default("1");
         /// Whether the alarm stays raised until a command clears it, even if the value is healthy again.
-        latched: bool, "", Any, Default("false");
+        latched: Option<bool>, "", Any, Optional("true for `thermal_event`, else false");
         /// J1939: suspect parameter number.
         spn: Option<u32>, "", Between(1.0, 524_287.0), Optional("520192 (manufacturer-assignable) plus the rule's number");
-        /// J1939: failure mode identifier. The defaults for info, warning and severe are 17, 18 and 1 for a low value, and 15, 16 and 0 for a high value. Some rules have one default for all severities: 9 (missing input), 2 (implausible input, disagreeing pack, faulty channel), 19 (bus fault) and 31 (untrusted estimate, failed store).
+        /// J1939: failure mode identifier. The defaults for info, warning and severe are 17, 18 and 1 for a low value, and 15, 16 and 0 for a high value. Some rules have one default for all severities: 9 (missing input), 2 (implausible input, disagreeing pack, faulty channel), 19 (bus fault) and 31 (untrusted estimate, failed store, thermal event).
         fmi: Option<u8>, "", Between(0.0, 31.0), Optional("by rule and severity");
     }
 }
