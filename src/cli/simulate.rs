@@ -176,12 +176,11 @@ fn cells_in_series(sample: &SampleConfig) -> u16 {
 
 /// Places each temperature sensor on the first cell it serves.
 fn wiring(sample: &SampleConfig) -> Wiring {
-    let sensors = sample.sensor_of_cell.iter().flatten().map(|s| s.0 + 1).max().unwrap_or(0);
     let cell_of = |sensor| {
         let cell = sample.sensor_of_cell.iter().position(|s| s.is_some_and(|s| s.0 == sensor))?;
         Some(CellIndex(u16::try_from(cell).ok()?))
     };
-    Wiring { strings: sample.strings.max(1), temperature_at: (0..sensors).map(cell_of).collect() }
+    Wiring { strings: sample.strings.max(1), temperature_at: (0..sample.sensors()).map(cell_of).collect() }
 }
 
 /// Encodes the frames of one sample. The frames with the current come first, because this current causes a part of the

@@ -3,7 +3,7 @@
 //! In: readings of cell voltages (V) and temperatures (degrees C) before the plausibility checks, because a thermal
 //! runaway changes them faster than plausible. Out: for each cell, whether there is evidence of a thermal event.
 //!
-//! * **Collapse**: within a minute, the voltage has fallen by [`FALL`], and by [`FALL`] more than the median of the other
+//! * **Collapse**: within half a minute, the voltage has fallen by [`FALL`], and by [`FALL`] more than the median of the other
 //!   cells. At least [`LEAST_READINGS`] readings in [`LEAST_S`] show it. The drop that the current explains is deducted.
 //!   A cell that may be almost empty is not judged, because its voltage can fall as fast. A broken sense wire raises the
 //!   voltage of a neighbour, and a dead channel repeats one value; neither counts.
@@ -54,7 +54,7 @@ const REFRESH_S: f64 = 30.0;
 const SETTLE_S: f64 = 60.0;
 /// A cell cannot cool by more than this between two readings (degrees C) at more than this rate (degrees C/s).
 const IMPOSSIBLE_FALL: (f64, f64) = (5.0, 0.5);
-/// Longest time for which a failed sensor must exceed its reading before the failure (s).
+/// Longest time for which a failed sensor must exceed what it showed before the failure (s).
 const FLOOR_S: f64 = 3600.0;
 /// Evidence lasts this long after the last reading that shows it (s).
 const HOLD_S: f64 = 60.0;
@@ -127,7 +127,7 @@ struct SensorState {
     shown: Option<(Timestamp, f64)>,
 }
 
-/// Reading of a sensor before it failed. Until the sensor has returned, only a rise above this reading counts.
+/// What a sensor showed before it failed. Until the sensor has returned, only a rise above this temperature counts.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Floor {
@@ -361,8 +361,8 @@ impl ThermalWatch {
         named.is_none().then(|| CellIndex(u16::try_from(cell).unwrap_or(u16::MAX)))
     }
 
-    /// Whether a temperature rises faster than the current and the other sensors explain, above the reading before a
-    /// failure of the sensor.
+    /// Whether a temperature rises faster than the current and the other sensors explain, above what the sensor showed
+    /// before a failure.
     fn is_rising(&self, now: Timestamp, sensor: usize, temperature_c: f64, heat: Heat) -> bool {
         let state = &self.sensors[sensor];
         let floor_c = state.floor.map_or(f64::NEG_INFINITY, |floor| floor.temperature_c);
@@ -399,12 +399,12 @@ impl ThermalWatch {
         median(rises.iter().copied()).filter(|_| rises.len() > 1).map(|rise| rise.max(0.0))
     }
 
-    /// Takes new references if they are due. `rate_per_h`: current relative to the rated capacity; `None` = unknown.
-    /// `least_soc`: lower bound of a cell's SOC; `None` = unknown. Returns whether new values are to be published.
+    /// Takes new references if they are due. `rate_per_h`: current of a cell relative to its rated capacity; `least_soc`:
+    /// lower bound of a cell's SOC; `None` = unknown. Returns whether new values are to be published.
     pub fn refresh(
         &mut self,
         now: Timestamp,
-        rate_per_h: Option<f64>,
+        rate_per_h: impl Fn(usize) -> Option<f64>,
         least_soc: impl Fn(usize) -> Option<f64>,
     ) -> bool {
         let elapsed_s = self.refreshed.map_or(f64::INFINITY, |at| now.since(at));
@@ -422,7 +422,7 @@ impl ThermalWatch {
             }
             self.falling -= usize::from(cell.fall.take().is_some());
             let is_fresh = std::mem::take(&mut cell.is_fresh);
-            let reference = |(_, voltage_v)| Reference { voltage_v, rate_per_h };
+            let reference = |(_, voltage_v)| Reference { voltage_v, rate_per_h: rate_per_h(index) };
             cell.references = [cell.references[1], cell.latest.filter(|_| is_fresh).map(reference)];
             cell.may_be_empty = least_soc(index).is_none_or(|soc| soc < ALMOST_EMPTY);
         }
@@ -460,9 +460,11 @@ impl SensorState {
         if let Some((_, before_c)) = self.latest.replace((now, temperature_c)) {
             let fall_c = before_c - temperature_c;
             if (fall_c > least_c && fall_c > rate_c_per_s * elapsed_s) || elapsed_s > SETTLE_S {
-                let highest_c = self.floor.map_or(before_c, |floor| floor.temperature_c.max(before_c));
-                self.floor = Some(Floor { since: now, temperature_c: highest_c, returned: None });
-                (self.first, self.shown) = (Some(now), None);
+                // The median: the latest reading may be a disturbance far above the temperature.
+                let usual_c = median(self.slow.0.iter().map(|(_, value)| *value));
+                let floor_c = usual_c.into_iter().chain(self.floor.map(|floor| floor.temperature_c)).reduce(f64::max);
+                self.floor = floor_c.map(|temperature_c| Floor { since: now, temperature_c, returned: None });
+                self.shown = None;
             }
         }
         let Some(floor) = &mut self.floor else { return };

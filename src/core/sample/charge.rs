@@ -19,7 +19,7 @@ use crate::quantity::bounds;
 use crate::quantity::{InvalidState, Timestamp};
 
 /// Longest interval, in multiples of `max_age_s`, in which the mean of both readings is the most likely current.
-pub const SHORT_GAP: f64 = 4.0;
+const SHORT_GAP: f64 = 4.0;
 
 /// Cumulative charge and unmeasured time at one moment.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]

@@ -72,6 +72,11 @@ pub struct SampleConfig {
 }
 
 impl SampleConfig {
+    /// Number of temperature sensors in use.
+    pub fn sensors(&self) -> u16 {
+        self.sensor_of_cell.iter().flatten().map(|sensor| sensor.0.saturating_add(1)).max().unwrap_or(0)
+    }
+
     /// Number of cells in series.
     pub const fn series(&self) -> u16 {
         match self.voltage_source {

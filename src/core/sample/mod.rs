@@ -17,7 +17,6 @@ pub mod sampler;
 pub mod signal;
 
 pub use cell_sample::{CellSample, Moment};
-pub use charge::SHORT_GAP;
 pub use config::{ContactorConfig, Limits, SampleConfig, VoltageSource};
 pub use counts::ReadingCounts;
 pub use sampler::{Sampler, SamplerState, SensorRange, SignalChange};

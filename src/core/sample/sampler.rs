@@ -119,7 +119,7 @@ struct SharedInputs {
 impl Sampler {
     /// Creates a sampler without readings.
     pub fn new(config: SampleConfig) -> Self {
-        let sensors = config.sensor_of_cell.iter().flatten().map(|sensor| sensor.index() + 1).max().unwrap_or(0);
+        let sensors = usize::from(config.sensors());
         let voltages = match config.voltage_source {
             VoltageSource::Cells => usize::from(config.cells),
             VoltageSource::PackTotal { .. } => 1,

@@ -65,11 +65,10 @@ impl LogReading {
 /// What a table of samples must fit: cells, sensors and size of the pack.
 fn table_options(config: &MonitorConfig) -> CsvOptions {
     let sample = &config.sample;
-    let sensors = sample.sensor_of_cell.iter().flatten().map(|sensor| sensor.0.saturating_add(1)).max();
     CsvOptions {
         cells: sample.cells,
         series: sample.series(),
-        sensors: sensors.unwrap_or_default(),
+        sensors: sample.sensors(),
         pack_total: matches!(sample.voltage_source, VoltageSource::PackTotal { .. }),
         reported_soc: sample.reported_soc.is_some(),
         capacity_ah: Some(config.model.rated_capacity_ah * f64::from(sample.strings)),

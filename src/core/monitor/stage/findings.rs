@@ -112,7 +112,8 @@ impl Findings {
     ) -> Vec<(CellIndex, Option<f64>)> {
         let Some(thermal) = &mut self.thermal else { return Vec::new() };
         let least_soc = |cell: usize| estimation.bank.soc(cell).map(|soc| soc.mean - 2.0 * soc.std());
-        if !thermal.refresh(now, rate_per_h(now, 0, sampling, estimation), least_soc) {
+        let rate_per_h = |cell: usize| rate_per_h(now, cell, sampling, estimation);
+        if !thermal.refresh(now, rate_per_h, least_soc) {
             return Vec::new();
         }
         thermal.evidence(now, &sampling.sampler.config().sensor_of_cell).collect()
@@ -220,8 +221,7 @@ fn rate_per_h(now: Timestamp, cell: usize, sampling: &Sampling, estimation: &Est
 /// Creates the watch if the rule `thermal_event` is configured.
 fn thermal_watch(config: &MonitorConfig) -> Option<ThermalWatch> {
     let is_wanted = config.rules.iter().any(|rule| rule.rule == Rule::ThermalEvent);
-    let sensors = config.sample.sensor_of_cell.iter().flatten().map(|sensor| sensor.index() + 1).max().unwrap_or(0);
-    is_wanted.then(|| ThermalWatch::new(usize::from(config.sample.cells), sensors))
+    is_wanted.then(|| ThermalWatch::new(config.sample.cells.into(), config.sample.sensors().into()))
 }
 
 /// Probability that the current sensor's offset is larger than [`OFFSET_PER_H`], and the learned offset as a fraction
