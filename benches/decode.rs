@@ -1,5 +1,5 @@
-//! Measures the time to decode one frame with [`InputMap::decode`], and to encode the frames of one set of values with
-//! [`InputEncoder`].
+//! Measures the time to decode one frame with [`InputMap::decode`], and the time to encode the frames of one set of
+//! values with [`InputEncoder`].
 
 use divan::{Bencher, black_box};
 use packwatch_host::can::dbc::Database;
@@ -8,7 +8,7 @@ use packwatch_host::can::encode::InputEncoder;
 use packwatch_host::can::{CanId, Frame};
 use packwatch_host::quantity::{BusIndex, CellIndex, Channel, SensorIndex};
 
-/// Number of cells of the shipped example pack. Each of the 32 multiplexer pages has the voltages of three cells.
+/// Number of cells of the example pack. Each of the 32 multiplexer pages has the voltages of three cells.
 const CELLS: u16 = 96;
 
 fn main() {

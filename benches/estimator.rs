@@ -1,5 +1,5 @@
-//! Measures the time of one estimator step. Also measures the time in which the whole core, from input frames to output
-//! frames, handles one reading of each cell of a 96-cell pack.
+//! Measures the time of one estimator step. Also measures how long the core, from input frames to output frames, takes
+//! for one reading of each cell of a 96-cell pack.
 
 use common::{example, reading};
 use packwatch_host::can::encode::InputEncoder;
@@ -9,7 +9,7 @@ use packwatch_host::quantity::{CellIndex, Channel, SensorIndex, Timestamp};
 
 mod common;
 
-/// Counts allocations, so that the output shows that a step allocates nothing.
+/// Counts allocations, to show that a step allocates nothing.
 #[global_allocator]
 static ALLOCATOR: divan::AllocProfiler = divan::AllocProfiler::system();
 
@@ -17,7 +17,7 @@ fn main() {
     divan::main();
 }
 
-/// The cell model of `config/example.toml`, with 1 to 3 equal RC branches.
+/// Returns the cell model of `config/example.toml`, with 1 to 3 equal RC branches.
 fn model(branches: usize) -> CellModel {
     let mut model = example().monitor.model;
     model.branches = vec![model.branches[0].clone(); branches];

@@ -14,7 +14,7 @@ fn main() {
 /// Lines of one log, about 12 MB.
 const LINES: u64 = 200_000;
 
-/// Classic frames of 8 bytes at a realistic bus rate. `line` gets the time in us and the data bytes.
+/// Creates classic frames of 8 bytes at a realistic bus rate. `line` gets the time (us) and the data bytes.
 fn log(header: &str, line: impl Fn(u64, [u8; 8]) -> String) -> Vec<u8> {
     let lines = (0..LINES).map(|n| line(n * 225, n.wrapping_mul(0x9E37_79B9_7F4A_7C15).to_le_bytes()));
     header.bytes().chain(lines.flat_map(String::into_bytes)).collect()

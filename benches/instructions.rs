@@ -2,8 +2,8 @@
 //!
 //! `instructions WORK PASSES` runs one of [`WORKS`] PASSES times over the same inputs. It prints the number of units
 //! per pass and the processor's SIMD extensions (such as AVX2), which select the estimator's code. `tests/instructions`
-//! counts the instructions of two such runs, the second with twice the passes. The difference of the two counts
-//! excludes start-up. Without arguments, as under `cargo bench`, the program prints the time of each workload.
+//! counts the instructions of two runs, the second with twice the passes. The difference excludes start-up. Without
+//! arguments, as under `cargo bench`, the program prints the time of each workload.
 #![expect(clippy::print_stdout, reason = "a program whose output is read by tests/instructions")]
 
 use std::hint::black_box;
@@ -24,7 +24,6 @@ use tempfile::NamedTempFile;
 
 mod common;
 
-/// Name, unit and constructor of each workload.
 const WORKS: [Named; 7] = [
     ("parse", "candump line of 8 bytes, read and placed in time", parse),
     ("parse_and_decode", "candump line and its 3 signals", parse_and_decode),
@@ -37,7 +36,7 @@ const WORKS: [Named; 7] = [
 
 /// Lines, frames or steps per pass.
 const UNITS: u32 = 9600;
-/// Number of passes timed under `cargo bench`.
+/// Number of passes that are timed under `cargo bench`.
 const TIMED_PASSES: u32 = 200;
 
 type Named = (&'static str, &'static str, fn() -> Work);
@@ -60,7 +59,7 @@ fn main() {
     }
 }
 
-/// SIMD extensions of this processor that select the estimator's code at run time.
+/// Returns the SIMD extensions of this processor that select the estimator's code at run time.
 fn features() -> String {
     #[cfg(target_arch = "x86_64")]
     let found = [
@@ -86,7 +85,7 @@ fn time((name, unit, work): &Named) {
     println!("{name:20} {:8.1} ns median per {unit}", took_ns[took_ns.len() / 2]);
 }
 
-/// A candump log with one message of three signals, one frame per millisecond.
+/// Writes a candump log with one message of three signals, one frame per millisecond.
 fn log() -> NamedTempFile {
     let line = |n: u64| {
         let data = n.wrapping_mul(0x9E37_79B9_7F4A_7C15);
@@ -115,7 +114,7 @@ fn parse_and_decode() -> Work {
     })
 }
 
-/// Calls `take` for each frame of a log. Reads and parses the lines and assigns times, as `replay` does.
+/// Calls `take` for each frame of a log. The lines are read, parsed and given times as in `replay`.
 fn each_frame(log: &NamedTempFile, mut take: impl FnMut(BusIndex, &Frame)) {
     let options = LogOptions {
         interfaces: vec!["can0".to_owned()],
@@ -160,7 +159,7 @@ fn decode_page() -> Work {
     })
 }
 
-/// The cell model of `config/example.toml`, with 1 to 3 equal RC branches, and the estimator's settings.
+/// Returns the cell model of `config/example.toml`, with 1 to 3 equal RC branches, and the estimator's settings.
 fn cell(branches: usize) -> (CellModel, EstimatorConfig) {
     let monitor = example().monitor;
     let mut model = monitor.model;

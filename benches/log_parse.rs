@@ -18,7 +18,7 @@ fn main() {
 /// Lines of one log, about 10 MB.
 const LINES: u64 = 200_000;
 
-/// Classic frames of 8 bytes with three signals each, at a realistic bus rate.
+/// Creates classic frames of 8 bytes with three signals each, at a realistic bus rate.
 fn log() -> Vec<u8> {
     let line = |n: u64| {
         let data = n.wrapping_mul(0x9E37_79B9_7F4A_7C15);

@@ -18,7 +18,7 @@ use packwatch::io::log::{LogOptions, LogSource};
 use packwatch::io::ticks::Ticks;
 use packwatch::monitor::{Monitor, Outputs, Record, TICK_PERIOD_MS};
 
-/// If a gap in the log is longer than this time in seconds, the program assumes that the recorder was asleep.
+/// A gap in the log longer than this (s) means that the recorder was asleep.
 const SLEEP_GAP_S: f64 = 5.0;
 
 fn main() -> Result<(), Box<dyn Error>> {
@@ -40,7 +40,7 @@ pub(crate) fn monitor_log(config: &Path, log: &Path, out: &mut impl Write) -> Re
     };
     let mut source = LogSource::new([log.to_owned()], options);
 
-    // The core is a state machine: pass it every record and every tick in time order.
+    // The core is a state machine. Pass it every record and every tick in time order.
     let mut monitor = Monitor::new(config.monitor);
     let (mut outputs, mut frames) = (Outputs::default(), 0);
     let mut handle = |monitor: &mut Monitor, record: &Record| -> io::Result<()> {

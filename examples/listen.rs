@@ -5,9 +5,9 @@
 //! cargo run --example listen -- config/packwatch.dbc <frames.log
 //! ```
 //!
-//! Reads candump lines from standard input and prints a line for every change. The program follows rules 1 to 4 of the
-//! contract (`docs/src/ecu/contract.md`). It leaves out rule 5, which confirms the table by its checksum. Time-outs are
-//! checked when a frame arrives; a real ECU also checks them by its own clock.
+//! The program reads candump lines from standard input and prints a line for every change. It follows rules 1 to 4 of
+//! the contract (`docs/src/ecu/contract.md`). Rule 5, which confirms the table by its checksum, is left out. Time-outs
+//! are checked when a frame arrives. A real ECU also checks them by its own clock.
 
 use std::collections::BTreeMap;
 use std::error::Error;
@@ -16,10 +16,10 @@ use std::io::{self, BufRead, Write};
 use packwatch::can::dbc::{Database, Message, Signal};
 use packwatch::can::{CanId, Frame};
 
-/// If no status frame arrives for this time in seconds, all values are unknown.
+/// If no status frame arrives for this time (s), all values are unknown.
 const STATUS_TIMEOUT_S: f64 = 0.3;
-/// If no frame of an alarm arrives for this number of passes, the alarm is no longer raised. In one pass packwatch
-/// sends a frame of each raised alarm.
+/// An alarm ends if none of its frames arrives for this number of passes. In one pass, packwatch sends a frame of each
+/// raised alarm.
 const PASSES: f64 = 7.0;
 
 fn main() -> Result<(), Box<dyn Error>> {
@@ -27,7 +27,6 @@ fn main() -> Result<(), Box<dyn Error>> {
     listen(&std::fs::read_to_string(dbc)?, io::stdin().lock(), &mut io::stdout().lock())
 }
 
-/// Reads the frames of a candump log, and writes a line for every change.
 pub(crate) fn listen(dbc: &str, log: impl BufRead, out: &mut impl Write) -> Result<(), Box<dyn Error>> {
     let mut listener = Listener::new(Database::parse(dbc)?);
     for line in log.lines() {
@@ -38,7 +37,7 @@ pub(crate) fn listen(dbc: &str, log: impl BufRead, out: &mut impl Write) -> Resu
     Ok(())
 }
 
-/// Time in s and frame of a candump line: `(1700000000.000000) vcan0 6B0#0000FFFF0F1CF8BF`.
+/// Returns time (s) and frame of a candump line such as `(1700000000.000000) vcan0 6B0#0000FFFF0F1CF8BF`.
 fn parse(line: &str) -> Option<(f64, Frame)> {
     let (stamp, rest) = line.strip_prefix('(')?.split_once(") ")?;
     let (id, digits) = rest.split_whitespace().nth(1)?.split_once('#')?;
@@ -54,10 +53,9 @@ type Key = (String, String, String);
 /// The receiver. All times are frame times (s).
 struct Listener {
     database: Database,
-    /// Time of the latest frame of each raised alarm.
     alarms: BTreeMap<Key, f64>,
-    /// Duration of a pass in seconds, from the latest digest frame that states it. Before that frame, the cycle time of
-    /// the alarm frames.
+    /// Duration of a pass (s), from the latest digest frame that states it. Until then, it is the cycle time of the
+    /// alarm frames.
     pass_time_s: f64,
     status_at_s: Option<f64>,
     validity: String,
@@ -113,7 +111,8 @@ impl Listener {
         Ok(())
     }
 
-    /// Removes the alarms whose rule the digest reports as not raised: the frame that announced the end was lost.
+    /// Removes the alarms whose rule the digest reports as not raised. The frame that announced the end of such an
+    /// alarm was lost.
     fn handle_digest(&mut self, now_s: f64, signals: &Signals, out: &mut impl Write) -> io::Result<()> {
         if let Some(Ok(pass_time_s)) = signals.get("PassTime").map(|text| text.parse()) {
             self.pass_time_s = pass_time_s;
@@ -127,7 +126,7 @@ impl Listener {
         Ok(())
     }
 
-    /// Discards the status if status frames have stopped, and each alarm whose frames have stopped.
+    /// Discards the status and each alarm whose frames have stopped.
     fn check_time(&mut self, now_s: f64, out: &mut impl Write) -> io::Result<()> {
         if self.status_at_s.is_some_and(|at_s| now_s - at_s > STATUS_TIMEOUT_S) {
             (self.status_at_s, self.validity) = (None, "unavailable".to_owned());
@@ -153,10 +152,8 @@ fn words((rule, severity, cell): &Key) -> String {
     format!("{rule} {severity} {cell}")
 }
 
-/// Names of signals, and their values as words or numbers.
 type Signals = BTreeMap<String, String>;
 
-/// The signals present in a frame.
 fn decode(message: &Message, data: &[u8]) -> Signals {
     let is_present = |signal: &&Signal| {
         signal.conditions.iter().all(|condition| {
@@ -169,8 +166,8 @@ fn decode(message: &Message, data: &[u8]) -> Signals {
     present.filter_map(|signal| Some((signal.name.clone(), value(signal, data)?))).collect()
 }
 
-/// The DBC's name for the value or, if the DBC has no name for it, the number. `None` if the frame is too short for the
-/// signal.
+/// Returns the DBC's name for the value or, if it has no name, the number. Returns `None` if the frame is too short for
+/// the signal.
 fn value(signal: &Signal, data: &[u8]) -> Option<String> {
     let plan = signal.layout.plan().ok()?;
     let code = i64::try_from(plan.raw(data).ok()?).ok();

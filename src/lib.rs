@@ -5,7 +5,7 @@
 //! of this crate. A folder inside a crate is a module. A module uses only modules above it in this table
 //! (`tests/integration/layering.rs` checks this rule).
 //!
-//! | crate | module | what lives there |
+//! | crate | module | content |
 //! | --- | --- | --- |
 //! | `src/core` | [`quantity`] | time, cell numbers, faults, conventions of sign and unit |
 //! | | [`filter`] | unscented and linear Kalman filters, vector arithmetic: pure numbers |

@@ -1,9 +1,8 @@
-//! Checks that processing a frame allocates no memory in steady state. The tests cover the log reader and the core with
-//! the 96 cells of `config/example.toml`, including ticks and sent frames. Allocations are permitted for the first
-//! frames (buffers grow), for transitions between charge, discharge and rest, for events, and at the end of a row of
-//! the diagnosis (see `BLOCKS_OF_A_ROW`).
+//! Checks that processing a frame allocates no memory in steady state, in the log reader and in the core with the 96
+//! cells of `config/example.toml`. Allocations are permitted in four cases: the first frames (buffers grow),
+//! transitions between charge, discharge and rest, events, and the end of a row of the diagnosis.
 //!
-//! The allocations of all threads of the process are counted. If a test fails, `dhat-heap.json` shows the allocations.
+//! All threads of the process are counted. If a test fails, `dhat-heap.json` shows the allocations.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -19,21 +18,20 @@ use packwatch::monitor::{Monitor, Outputs, Record, RecordKind, TICK_PERIOD_MS};
 #[global_allocator]
 static ALLOCATOR: dhat::Alloc = dhat::Alloc;
 
-/// If a gap in the log is longer than this (s), the recorder counts as asleep. This log has no gap.
+/// If a gap in the log is longer (s), the recorder counts as asleep. This log has no gap.
 const SLEEP_GAP_S: f64 = 30.0;
 /// Length of the log (s).
 const LOG_S: f64 = 160.0;
 /// Length of the warm-up (s). In this time, health frames for all 96 cells are sent.
 const WARM_S: f64 = 110.0;
-/// Minimum number of frames after the warm-up. The remaining 50 s contain more: 10 currents and 32 other frames every
-/// 100 ms.
+/// The 50 s after the warm-up contain more: 10 currents and 32 other frames every 100 ms.
 const MIN_FRAMES: u64 = 20_000;
 
-/// Maximum number of memory blocks that the core with 96 cells may allocate when a row of the diagnosis ends. A row
-/// holds the sums of each cell's samples over a few minutes. The diagnosis computes its findings from rows.
+/// Limit at the end of a row with 96 cells. A row holds the sums of each cell's samples over a few minutes, from which
+/// the diagnosis computes its findings.
 const BLOCKS_OF_A_ROW: u64 = 64;
 
-/// Serialises the tests, because each counts the allocations of the whole process.
+/// Each test counts the allocations of the whole process, so they must not run in parallel.
 fn alone() -> MutexGuard<'static, ()> {
     static ALONE: Mutex<()> = Mutex::new(());
     ALONE.lock().unwrap_or_else(PoisonError::into_inner)
@@ -49,7 +47,6 @@ fn allocating_at_most(most: u64, what: &str, work: impl FnOnce()) {
     let profiler = dhat::Profiler::builder().testing().build();
     work();
     let blocks = dhat::HeapStats::get().total_blocks;
-    // If it fails, dhat's own assertion saves the allocation sites in `dhat-heap.json`.
     dhat::assert!(blocks <= most, "{what}: {blocks} blocks allocated");
     drop(profiler);
 }
@@ -58,7 +55,6 @@ fn example() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("config/example.toml")
 }
 
-/// Simulates a log of the example's pack, with the current every 10 ms and the cells every 100 ms. Returns its path.
 fn pack_log(folder: &Path) -> PathBuf {
     let log = folder.join("pack.log");
     let mut simulate = Command::new(env!("CARGO_BIN_EXE_packwatch"));
@@ -92,7 +88,6 @@ fn next(source: &mut LogSource) -> Option<Record> {
     source.next_record().expect("a good log")
 }
 
-/// Whether the warm-up is over at the time of `record`.
 fn is_warm(record: &Record, first: &Record) -> bool {
     record.time.since(first.time) >= WARM_S
 }
@@ -132,7 +127,7 @@ fn frame_read_from_log_allocates_nothing() {
     while !is_warm(&next(&mut source).expect("a long log"), &first) {}
     let mut frames = 0;
     without_allocating("reading a log", || {
-        // Stop before the end of the file: there, the reader does work that occurs only once per file.
+        // Stop before the end of the file. There the reader does work that occurs only once per file.
         while frames < MIN_FRAMES {
             let record = next(&mut source).expect("a long log");
             frames += u64::from(matches!(record, Record { kind: RecordKind::Frame { .. }, .. }));
@@ -140,7 +135,6 @@ fn frame_read_from_log_allocates_nothing() {
     });
 }
 
-/// The core, driven as in a replay.
 struct Core {
     monitor: Monitor,
     ticks: Ticks,
@@ -187,7 +181,6 @@ fn frame_through_core_allocates_nothing() {
     assert!(steady.len() as u64 > MIN_FRAMES, "{} frames", steady.len());
     before.iter().for_each(|record| core.feed(record));
     (core.sent, core.events) = (0, 0);
-    // A row of the diagnosis may end in this part of the log, and may then allocate.
     allocating_at_most(BLOCKS_OF_A_ROW, "the core", || steady.iter().for_each(|record| core.feed(record)));
     assert!(core.sent > 500, "{} frames sent: status ten times a second, health, alarms", core.sent);
     assert!(core.monitor.latest().flatten().count() == 96, "every cell must have an estimate");

@@ -3,14 +3,14 @@
 use packwatch_host::cell::CellStep;
 use packwatch_host::config::{self, Config};
 
-/// `config/example.toml`.
+/// Loads `config/example.toml`.
 pub(crate) fn example() -> Config {
     let path = std::path::Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../config/example.toml"));
     config::load(path).unwrap_or_else(|faults| panic!("{faults:?}"))
 }
 
-/// Reading `k` of a cell: ten readings a second, and a current that reverses every 30 s. Each cell's voltage is 0.5 mV
-/// above the previous cell's. Groups of eight cells share a temperature.
+/// Returns reading `k` of a cell. There are ten readings a second, and the current reverses every 30 s. Each cell's
+/// voltage is 0.5 mV above that of the previous cell. Groups of eight cells share a temperature.
 pub(crate) fn reading(k: u32, cell: usize) -> CellStep {
     let current_a = if k % 600 < 300 { 1.0 } else { -1.0 };
     CellStep {

@@ -1,4 +1,4 @@
-//! `packwatch alarms`: the alarms of the running daemon, as a table or as JSON.
+//! `packwatch alarms`: lists the alarms of the running daemon as a table or as JSON.
 
 use std::fmt::Write as _;
 
@@ -23,7 +23,6 @@ pub(crate) struct Args {
     control: ControlArgs,
 }
 
-/// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let line = args.control.client().ask_line(Request::Alarms { all: args.all }).map_err(Failure::new)?;
     let list: AlarmList = contents(&line).map_err(Failure::new)?;

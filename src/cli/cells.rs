@@ -24,7 +24,6 @@ pub(crate) struct Args {
     json: bool,
 }
 
-/// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let folders = match args.folders.is_empty() {
         true => library::usual_folders(std::env::current_exe().ok().as_deref()),
@@ -84,7 +83,7 @@ fn listed(models: &[(PathBuf, SourcedModel)]) -> String {
     page
 }
 
-/// Returns the voltage error that the model states or, if the model states none, the residuals of its fit.
+/// Returns the voltage error (mV) that the model states or, if the model states none, the residuals of its fit (mV).
 fn error(sourced: &SourcedModel) -> String {
     match (sourced.error_v(), sourced.source.residual_v()) {
         (Some(error_v), _) => format!("{:.0}", 1e3 * error_v),

@@ -33,7 +33,6 @@ pub(crate) struct Args {
     reference: bool,
 }
 
-/// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let Some(file) = &args.file else {
         return print(&crate::config::reference());

@@ -51,7 +51,6 @@ enum PollAction {
     Resume,
 }
 
-/// Runs `poll`.
 pub(crate) fn poll(args: &PollArgs) -> Result<(), Failure> {
     let standby = args.action == PollAction::Standby;
     let request = Request::Command(Command::Poll { standby });
@@ -65,17 +64,14 @@ pub(crate) fn poll(args: &PollArgs) -> Result<(), Failure> {
     }
 }
 
-/// Runs `acknowledge`.
 pub(crate) fn acknowledge(args: &AlarmArgs) -> Result<(), Failure> {
     send(&args.control.client(), Command::Acknowledge(args.which.selector()), "acknowledged")
 }
 
-/// Runs `clear`.
 pub(crate) fn clear(args: &AlarmArgs) -> Result<(), Failure> {
     send(&args.control.client(), Command::Clear(args.which.selector()), "cleared")
 }
 
-/// Runs `pack-replaced`.
 pub(crate) fn pack_replaced(args: &ReplacedArgs) -> Result<(), Failure> {
     replace_pack(args.yes, &args.control.client())
 }

@@ -24,10 +24,8 @@ use crate::monitor::{BusEvent, RecordKind};
 use crate::quantity::Timestamp;
 use crate::replay::ReplayProgress;
 
-/// Number of records between two progress reports.
 const REPORT_EVERY: u64 = 4096;
 
-/// Formats by name.
 const FORMATS: [NamedValue<Format>; 3] = [
     ("candump", Format::Candump, "text as `candump -L` writes it: .log, also .gz and .zst"),
     ("mf4", Format::Mf4, "ASAM MDF 4 with bus logging: .mf4"),
@@ -60,7 +58,6 @@ pub(crate) struct Args {
     input: InputArgs,
 }
 
-/// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     check_place(&args.out, args.logs.iter()).map_err(Failure::new)?;
     if !args.force && args.out.is_file() {
@@ -90,7 +87,6 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     Ok(())
 }
 
-/// What was written.
 #[derive(Default)]
 struct Summary {
     frames: u64,
@@ -116,7 +112,6 @@ impl Summary {
     }
 }
 
-/// Writes the frames of all logs.
 fn write_frames(args: &Args, config: Option<&Config>, output: &mut Output) -> Result<Summary, Failure> {
     let mut source = LogSource::new(args.logs.clone(), options(args, config));
     source.adopt_foreign();

@@ -1,9 +1,7 @@
 //! `packwatch dbc`: writes a DBC that describes the configured output frames, for the ECUs that receive them.
 //!
-//! The DBC is generated from the layout that the encoder uses. Its identifiers, frame formats, end-to-end protection,
-//! cycle times and value tables therefore match the sent frames. The output file gets its final name only when it is
-//! complete.
-//! The exit code is 78 if the configuration is invalid or has no frames to send.
+//! The DBC is generated from the layout that the encoder uses, so it matches the sent frames. The output file gets its
+//! final name only when it is complete. The exit code is 78 if the configuration is invalid or has no frames to send.
 
 use std::path::PathBuf;
 
@@ -23,7 +21,6 @@ pub(crate) struct Args {
     output: PathBuf,
 }
 
-/// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let config = config::load(&args.config)?;
     let Some(layout) = config.output_layout else {

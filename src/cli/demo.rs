@@ -55,7 +55,6 @@ pub(crate) struct Args {
     seed: u64,
 }
 
-/// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let config = config::load_with(&ConfigFiles::alone(Path::new("demo.toml")), &read_built_in)?;
     let mut demo = Demo::new(config, args.seed)?;
@@ -194,7 +193,6 @@ impl Demo {
         last.is_some_and(|(a, b)| self.sim.pack().cycles() + 1 > a.cycle.max(b.cycle) + 1)
     }
 
-    /// A table row with the present estimates and the true values.
     fn row(&self, moment: &Moment, cycles: u32) -> String {
         let soc = match self.monitor.latest().next().flatten() {
             Some(e) => format!("{:6.1} +-{:5.1}", 100.0 * e.soc, 100.0 * e.soc_std),

@@ -51,7 +51,6 @@ pub(crate) struct Args {
     json: bool,
 }
 
-/// The printed document.
 #[derive(Debug, Serialize)]
 struct Page {
     version: u32,
@@ -87,7 +86,6 @@ struct CellRow {
     leak_per_day: Option<Value>,
 }
 
-/// A value with its standard deviation.
 #[derive(Debug, Clone, Copy, Serialize)]
 struct Value {
     mean: f64,
@@ -100,7 +98,6 @@ impl From<ScalarGaussian> for Value {
     }
 }
 
-/// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let config = args.config.as_deref().map(config::load).transpose()?;
     let snapshot = match (&args.state, &config) {

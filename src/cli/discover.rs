@@ -88,7 +88,7 @@ impl Known {
     }
 }
 
-/// Result of a search, and what made it.
+/// Result of a search, and the discoverer that made it.
 pub(crate) struct Search {
     discoverer: Discoverer,
     pub(crate) discovery: Discovery,
@@ -96,7 +96,6 @@ pub(crate) struct Search {
     interfaces: Vec<String>,
 }
 
-/// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let search = search(std::slice::from_ref(&args.log), &args.known, Vec::new())?;
     let discovery = &search.discovery;
@@ -118,7 +117,6 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     Ok(())
 }
 
-/// The files that are read.
 pub(crate) fn inputs<'a>(logs: &'a [PathBuf], known: &'a Known) -> impl Iterator<Item = &'a PathBuf> + Clone {
     logs.iter().chain(&known.dbc).chain(&known.obdb).chain(&known.model)
 }
@@ -149,12 +147,11 @@ pub(crate) fn search(logs: &[PathBuf], known: &Known, channels: Vec<(String, Str
 }
 
 impl Search {
-    /// Names of the interfaces in the logs.
     pub(crate) fn interfaces(&self) -> &[String] {
         &self.interfaces
     }
 
-    /// The configuration to be saved as `file`, or the questions that the log and the user leave open.
+    /// The configuration to be saved as `file`. The inner error states what neither the log nor the user has specified.
     pub(crate) fn configuration(
         &self,
         log: &Path,

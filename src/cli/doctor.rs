@@ -55,7 +55,6 @@ pub(crate) struct Args {
     start_times: Option<PathBuf>,
 }
 
-/// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let mut survey = wiring_check::survey(&args.config)?;
     rename_interfaces(args, &mut survey)?;

@@ -13,10 +13,8 @@ use crate::lab::fleet::LogAccess;
 use crate::lab::fleet::export::{self, ExportResult, ExportSettings, TableFormat};
 use packwatch_host::failure::Failure;
 
-/// Version of the JSON document.
 const VERSION: u32 = 1;
 
-/// Table formats by name.
 const FORMATS: [NamedValue<TableFormat>; 2] = [
     ("parquet", TableFormat::Parquet, "Apache Parquet, compressed with Snappy"),
     ("csv", TableFormat::Csv, "CSV with a heading"),
@@ -53,7 +51,6 @@ pub(crate) struct Args {
     logs: LogArgs,
 }
 
-/// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     if args.columns_page {
         return unless_closed(io::stdout().write_all(export::reference().as_bytes()));

@@ -40,7 +40,6 @@ fn credential() -> Option<PathBuf> {
     Some(folder.join("exporter-token")).filter(|file| file.exists())
 }
 
-/// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     logging::start(args.log.as_deref()).map_err(Failure::new)?;
     let socket = args.socket.clone().unwrap_or_else(standard_path);

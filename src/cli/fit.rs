@@ -126,7 +126,6 @@ fn soc_nodes(text: &str) -> Result<SocNodes, String> {
     text.split(',').map(finite).collect::<Result<_, _>>().map(SocNodes)
 }
 
-/// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let begin = Instant::now();
     let mut request = request(args);
@@ -151,7 +150,8 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     unless_closed(report::table(&outcome, seconds, &args.out))
 }
 
-/// Fits to logs. If no name is given, the name comes from the configuration; the rated capacity always does.
+/// Fits to logs. If no name is given, the name comes from the configuration. The rated capacity always comes from the
+/// configuration.
 fn fit_logs(
     args: &Args,
     request: &mut FitRequest,

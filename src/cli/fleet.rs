@@ -1,4 +1,5 @@
-//! `packwatch fleet`: replays the vehicles of a fleet in shards, on any machines, and merges their tables.
+//! `packwatch fleet`: replays the vehicles of a fleet and merges their tables. The fleet can be split into shards that
+//! run on different machines.
 
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
@@ -24,7 +25,6 @@ use crate::lab::fleet::vehicle::{Vehicle, VehicleRecord};
 use crate::lab::fleet::vehicles::{self, Outcome, Shard};
 use packwatch_host::failure::Failure;
 
-/// Version of the JSON documents.
 const VERSION: u32 = 1;
 
 /// Arguments of `fleet`.
@@ -133,7 +133,6 @@ struct PriorArgs {
     rated: Option<f64>,
 }
 
-/// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     match &args.command {
         FleetCommand::Plan(args) => plan(args),

@@ -138,7 +138,6 @@ fn read(files: &[PathBuf], wanted: &ColumnSelection<'_>, part: &PartColumn) -> R
     Ok(table)
 }
 
-/// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     match &args.what {
         GprCommand::Cv(args) => cv(args),

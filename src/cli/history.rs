@@ -12,7 +12,6 @@ use crate::quantity::Timestamp;
 use crate::store::{self, HistoryEntry, HistoryQuery, HistoryReader, HistoryTable, NotedHead};
 use packwatch_host::failure::Failure;
 
-/// Version of the JSON document.
 const VERSION: u32 = 1;
 /// Number of rows that are listed by default. They fill a few screens.
 const LISTED: u32 = 100;
@@ -81,7 +80,6 @@ struct RowArgs {
     until: Option<Timestamp>,
 }
 
-/// Kinds of rows by name.
 const KINDS: [NamedValue<HistoryTable>; 8] = [
     ("half-cycle", HistoryTable::HalfCycle, "Charges and discharges"),
     ("capacity", HistoryTable::Capacity, "Learned capacities"),
@@ -94,7 +92,6 @@ const KINDS: [NamedValue<HistoryTable>; 8] = [
 ];
 
 impl RowArgs {
-    /// Checks arguments that depend on each other.
     fn check(&self) -> Result<(), Failure> {
         match (self.since, self.until) {
             (Some(since), Some(until)) if since > until => {
@@ -120,7 +117,6 @@ fn when(text: &str) -> Result<Timestamp, String> {
         .ok_or_else(|| "must be seconds since 1970, or a time such as 2026-04-02T13:08:17".to_owned())
 }
 
-/// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let wanted = if let Some(HistoryCommand::Export(export)) = &args.what { &export.wanted } else { &args.wanted };
     wanted.check()?;
@@ -161,7 +157,6 @@ fn line(entry: &HistoryEntry) -> String {
     format!("{time:<26}  {:>4}  {:<14}  {cell:>4}  {}\n", entry.pack, entry.kind.name(), describe(entry))
 }
 
-/// Describes the values of a row.
 fn describe(entry: &HistoryEntry) -> String {
     let value = |name: &str| {
         let column = entry.kind.columns().iter().position(|column| *column == name);

@@ -96,7 +96,6 @@ struct OutputArgs {
     output: PathBuf,
 }
 
-/// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     match &args.what {
         ImportCommand::Obdb(args) => import_obdb(args),

@@ -1,8 +1,9 @@
 //! `packwatch look`: from logs to a verdict in one command.
 //!
-//! The command finds the battery's signals in the logs, makes the configuration that follows, checks the wiring, and
-//! replays the logs into a report. A table needs a label instead of a search. If the logs and the label leave a question open, the command asks it and says which
-//! option answers it. The exit code is 0 if a report was written, and 1 otherwise.
+//! Finds the battery's signals in the logs, makes a configuration from them, checks the wiring, and replays the logs
+//! into a report. For a table, the label replaces the search for signals. If the logs and the label leave a question
+//! open, the command prints the question and the option that answers it. The exit code is 0 if a report was written,
+//! and 1 otherwise.
 
 mod table;
 
@@ -54,7 +55,6 @@ pub(crate) struct Args {
     out: PathBuf,
 }
 
-/// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let inputs = || discover::inputs(&args.files, &args.known);
     args.write.iter().try_for_each(|write| check_place(write, inputs())).map_err(Failure::new)?;
@@ -141,14 +141,13 @@ fn logs(args: &Args, search: &Search) -> Vec<String> {
     lines
 }
 
-/// What is wrong with the lines of the logs.
+/// Describes faults in the lines of the logs.
 fn damage(counts: &LogCounts) -> Vec<String> {
     let bad = counts.first_bad_line.iter().map(|first| format!("{} bad lines, first {first}", counts.bad_lines));
     let back = counts.first_time_backwards.iter();
     bad.chain(back.map(|first| format!("{} stamps backwards, first {first}", counts.time_backwards))).collect()
 }
 
-/// The best candidate of each quantity.
 fn signals(search: &Search) -> Vec<String> {
     let best = |quantity: PackQuantity| {
         let found = search.discovery.candidates.iter().find(|candidate| candidate.quantity == quantity);
@@ -161,7 +160,7 @@ fn signals(search: &Search) -> Vec<String> {
     PackQuantity::ALL.into_iter().map(best).chain(search.discovery.remarks.iter().cloned()).collect()
 }
 
-/// Writes the configuration unless the file exists. Returns what it contains or leaves open.
+/// Writes the configuration unless the file exists. Returns lines about its contents, or the open questions.
 fn configure(
     args: &Args,
     file: &Path,

@@ -78,7 +78,6 @@ struct CompareArgs {
     json: bool,
 }
 
-/// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     match &args.what {
         ModelCommand::Show(args) => show(args),

@@ -27,7 +27,6 @@ use packwatch_host::failure::Failure;
 /// Maximum size of the file with the manufacturer's part, bytes. A passport has about 10 kB.
 const MAX_STATIC_BYTES: u64 = 16 << 20;
 
-/// Standards by name.
 const STANDARDS: [NamedValue<Standard>; 2] = [
     (
         "product-condition",
@@ -92,7 +91,6 @@ fn at_least_0(text: &str) -> Result<f64, String> {
     within(text, |value| value >= 0.0, "a finite number, 0 or more")
 }
 
-/// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     args.check()?;
     let Some(config) = &args.config else { return write(&args.out, &passport::template(args.form)) };
@@ -193,7 +191,6 @@ fn reading_limits(config: &Config) -> ReadingLimits {
     }
 }
 
-/// Writes an indented document.
 fn write(path: &Path, document: &Value) -> Result<(), Failure> {
     let mut bytes = Vec::new();
     document.serialize(&mut serde_json::Serializer::pretty(&mut bytes)).map_err(failure)?;

@@ -24,7 +24,6 @@ use packwatch_host::failure::Failure;
 
 pub(crate) use args::Args;
 
-/// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     args.check()?;
     let config = config::load(&args.config)?;

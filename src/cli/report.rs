@@ -52,12 +52,11 @@ pub(crate) struct Args {
     pub(crate) input: InputArgs,
 }
 
-/// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     write(args).map(drop)
 }
 
-/// Writes the page, and the plots if they are wanted. Returns what the page says first.
+/// Writes the page, and the plots if they are wanted. Returns the verdict at the top of the page.
 pub(crate) fn write(args: &Args) -> Result<Verdict, Failure> {
     args.check()?;
     let config = args.config.as_deref().map(config::load).transpose()?;
@@ -114,7 +113,6 @@ fn config_text(path: &Path) -> Result<String, Failure> {
 }
 
 impl Args {
-    /// Checks arguments that depend on each other.
     fn check(&self) -> Result<(), Failure> {
         let inputs = self.logs.iter().chain(&self.config).chain(&self.reference);
         check_place(&self.out, inputs).map_err(Failure::new)
@@ -134,7 +132,6 @@ impl Args {
 /// What a report is made from: data, provenance, vehicle and last state.
 type ReportInput = (Data, Provenance, VehicleIdentity, Option<Snapshot>);
 
-/// Lines of the provenance: name and value.
 type Provenance = Vec<(String, String)>;
 
 fn load_store(folder: &Path) -> Result<ReportInput, Failure> {

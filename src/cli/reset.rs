@@ -24,7 +24,6 @@ pub(crate) struct Args {
     control: ControlArgs,
 }
 
-/// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let client = args.control.client();
     if !args.yes || client.is_served() {

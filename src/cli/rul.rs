@@ -39,7 +39,6 @@ pub(crate) struct Args {
     json: bool,
 }
 
-/// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     // At most one point for each percent is useful.
     if args.at.len() > 99 {

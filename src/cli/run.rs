@@ -1,4 +1,4 @@
-//! `packwatch run`: the service on live CAN interfaces.
+//! `packwatch run`: runs the service on live CAN interfaces.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -79,7 +79,6 @@ pub(crate) struct Args {
 /// Largest receive buffer, bytes: half the kernel's limit, because the kernel doubles the requested size.
 const MAX_BUFFER_BYTES: usize = (i32::MAX / 2) as usize;
 
-/// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     logging::start(args.log.as_deref()).map_err(Failure::new)?;
     let record_limits = args.record_limit.map(|total| SegmentLimits::new(total, args.record_segment)).transpose();

@@ -9,7 +9,6 @@ use super::common::logs::print_tables;
 use super::common::output::{failure, print};
 use packwatch_host::failure::Failure;
 
-/// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let run = args.request().prepare(&|| ())?;
     let bar = bar::Bar::new(run.jobs());

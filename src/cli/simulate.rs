@@ -59,7 +59,6 @@ pub(crate) struct Args {
     changes: settings::Changes,
 }
 
-/// Totals of a run.
 #[derive(Debug, Default)]
 struct Totals {
     frames: u64,
@@ -67,7 +66,6 @@ struct Totals {
     end_s: f64,
 }
 
-/// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let config = config::load(&args.config)?;
     let settings = settings_for(args, &config)?;
@@ -111,7 +109,6 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Destination of the frames.
 enum Sink {
     Log(LogWriter),
     Bus(Player),

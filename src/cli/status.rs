@@ -47,7 +47,6 @@ pub(crate) struct Args {
     socket: Option<PathBuf>,
 }
 
-/// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let client = StatusClient::new(args.socket.as_deref());
     if args.watch {
@@ -149,7 +148,6 @@ fn duration(seconds: f64) -> String {
     }
 }
 
-/// Describes the store in a line.
 fn store(document: &StatusDocument) -> String {
     let Some(store) = &document.store else { return "none".to_owned() };
     let works = match store.works {

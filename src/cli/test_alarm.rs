@@ -1,8 +1,8 @@
 //! `packwatch test-alarm`: asks the running daemon to send a rule's alarm frame as a test, and reports the frames seen
 //! on the bus.
 //!
-//! The command succeeds only if every interface received at least one such frame and all of these frames were intact
-//! and in sequence.
+//! The command succeeds only if every interface received at least one test frame, and if all frames were intact and in
+//! sequence.
 
 use std::fmt::Write as _;
 use std::path::PathBuf;
@@ -34,7 +34,6 @@ pub(crate) struct Args {
     control: ControlArgs,
 }
 
-/// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let config = config::load(&args.config)?;
     let duration = Duration::from_secs_f64(args.duration);
@@ -99,7 +98,6 @@ const ON_THE_WIRE: [AlarmState; 7] = [
     AlarmState::Unknown,
 ];
 
-/// Appends notes about the other frames of the interface.
 fn push_notes(text: &mut String, report: &ChannelReport) {
     let observed = &report.observed;
     for (&(rule, state), count) in &observed.genuine {

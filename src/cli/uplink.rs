@@ -11,7 +11,6 @@ use std::process::Command;
 
 use packwatch_host::failure::Failure;
 
-/// Name of the program.
 const PROGRAM: &str = "packwatch-uplink";
 
 /// Arguments of these commands; `packwatch-uplink` parses them and prints the help.

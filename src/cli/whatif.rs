@@ -81,7 +81,6 @@ pub(crate) struct Args {
     logs: LogArgs,
 }
 
-/// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     args.check()?;
     let grid = variants::grid(&args.config, &args.set)
@@ -150,7 +149,6 @@ impl Args {
         .collect()
     }
 
-    /// Rules to show.
     fn rules(&self, grid: &variants::VariantGrid) -> Vec<Rule> {
         let named = if self.rule.is_empty() { &grid.rules } else { &self.rule };
         let all = self.rule.is_empty() && (grid.other_keys || grid.rules.is_empty());

@@ -1,14 +1,15 @@
-//! The pure core: frames in; estimates, alarms and frames out. The core never reads a clock, a file or a socket and
-//! never logs. The same inputs therefore give the same outputs, byte for byte. No dependency of this crate does I/O.
-//! Keys for authenticated frames stay in the driver, the program that feeds the core. The driver writes the
-//! authenticators into sent frames. It also checks the authenticators of received frames and passes the results to the
-//! core.
+//! The pure core: turns frames into estimates, alarms and frames. The core never reads a clock, a file or a socket and
+//! never logs, and no dependency of this crate does I/O. The same inputs therefore give the same outputs, byte for
+//! byte.
+//!
+//! The driver is the program that feeds the core. It holds the keys for authenticated frames, writes the authenticators
+//! into sent frames, and tells the core whether the authenticators of received frames are correct.
 //!
 //! # Data path
 //! [`monitor::Monitor`] handles every record. Data flows in one direction. `monitor/message` defines the records that
-//! come in and the events, estimates and frames that go out; these types do not depend on any stage. Each file in
-//! `monitor/stage` contains one stage and does not depend on later stages. Only `monitor/stages.rs` knows the order of
-//! the stages. `monitor/lifecycle` restores and reconfigures the stages.
+//! come in and the events, estimates and frames that go out; it does not depend on any stage. Each file in
+//! `monitor/stage` contains one stage and does not depend on later stages. Only `monitor/stages.rs` contains the order
+//! of the stages. `monitor/lifecycle` restores and reconfigures the stages.
 //!
 //! | stage | in → out | file | algorithms |
 //! | --- | --- | --- | --- |

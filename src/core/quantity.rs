@@ -1,6 +1,6 @@
 //! Time, cell numbers, readings with their faults, and the conventions that every module keeps.
 //!
-//! Conventions inside the program (only `can` and `config` use wire units and wire signs):
+//! Conventions inside the program (only `can` and the configuration use wire units and wire signs):
 //! * current in A, **positive = discharge** (the paper's sign, dSOC/dt = -I / (3600 C));
 //! * voltage in V, temperature in degrees C, charge in Ah, resistance in ohm, time in s or [`Timestamp`];
 //! * SOC and SOH are fractions 0..1.
@@ -17,11 +17,10 @@ use serde::{Deserialize, Serialize};
 /// Length of a day (s).
 pub const DAY_S: f64 = 86_400.0;
 
-/// A point in time on the clock of the driver (the program that feeds the core), in integer nanoseconds.
+/// A point in time: integer nanoseconds on the clock of the driver, the program that feeds the core.
 ///
-/// The driver chooses the origin. The daemon counts from 1970: it reads the wall clock at its start, and then a clock
-/// that never steps. A replay uses the time stamps of its log. Apart from the freshness of authenticated messages, the
-/// core uses only differences.
+/// The daemon counts from 1970: it reads the wall clock once at its start, and then a clock that never steps. A replay
+/// uses the time stamps of its log. The core uses only differences, except for the freshness of authenticated messages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct Timestamp(i64);
@@ -38,8 +37,7 @@ impl Timestamp {
         Self(nanos)
     }
 
-    /// Creates a time stamp from seconds since the clock's origin, rounded to the nearest nanosecond. Saturates at the
-    /// ends of the range (292 years). NaN gives the origin.
+    /// Creates a time stamp from seconds since the clock's origin. Saturates (292 years); NaN gives the origin.
     pub fn from_secs(seconds: f64) -> Self {
         // Convert whole seconds separately: a float's 53 bits cannot hold nanoseconds since 1970.
         let whole = seconds.floor();
@@ -51,7 +49,7 @@ impl Timestamp {
         self.0
     }
 
-    /// Seconds since the clock's origin (a float: about 0.2 us resolution at today's Unix time).
+    /// Seconds since the clock's origin, with a resolution of about 0.2 us in today's Unix time.
     pub fn secs(self) -> f64 {
         self.0 as f64 * 1e-9
     }
@@ -59,17 +57,17 @@ impl Timestamp {
     /// Seconds from `earlier` to `self`; negative when `earlier` is later.
     #[inline]
     pub fn since(self, earlier: Self) -> f64 {
-        // A branch that is never taken costs less than a saturating subtraction in every call.
+        // A branch that is never taken is cheaper than a saturating subtraction.
         let nanos = self.0.checked_sub(earlier.0).unwrap_or_else(|| self.0.saturating_sub(earlier.0));
         nanos as f64 * 1e-9
     }
 
-    /// Returns this point moved by `seconds`, which may be negative.
+    /// This point moved by `seconds`, which may be negative.
     pub fn plus_secs(self, seconds: f64) -> Self {
         self.plus_nanos((seconds * 1e9).round() as i64)
     }
 
-    /// Returns this point moved by `nanos`, which may be negative.
+    /// This point moved by `nanos`, which may be negative.
     pub const fn plus_nanos(self, nanos: i64) -> Self {
         Self(self.0.saturating_add(nanos))
     }
@@ -78,10 +76,9 @@ impl Timestamp {
 /// An impossible number in a stored state.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct InvalidState {
-    /// Name of the number.
     pub what: &'static str,
     pub found: f64,
-    /// Allowed range, with unit.
+    /// Range with unit.
     pub allowed: &'static str,
 }
 
@@ -98,8 +95,7 @@ impl InvalidState {
         if is_sound { Ok(()) } else { Err(Self { what, found, allowed }) }
     }
 
-    /// Rejects numbers that are not finite or whose size exceeds 1e20. Squares and cubes of smaller numbers do not
-    /// overflow.
+    /// Rejects numbers that are not finite or exceed 1e20 in size, so that squares and cubes do not overflow.
     pub fn unless_number(what: &'static str, found: f64) -> Result<(), Self> {
         bounds::NUMBER.check(what, found)
     }
@@ -109,12 +105,12 @@ impl InvalidState {
         Self::unless((0.0..=1e20).contains(&found), what, found, "0 to 1e20")
     }
 
-    /// Applies [`Self::unless_number`] to every number and returns the first error.
+    /// Applies [`Self::unless_number`] to every number.
     pub fn unless_numbers(what: &'static str, all: impl IntoIterator<Item = f64>) -> Result<(), Self> {
         all.into_iter().try_for_each(|found| Self::unless_number(what, found))
     }
 
-    /// Applies [`Self::unless_natural`] to every number and returns the first error.
+    /// Applies [`Self::unless_natural`] to every number.
     pub fn unless_naturals(what: &'static str, all: impl IntoIterator<Item = f64>) -> Result<(), Self> {
         all.into_iter().try_for_each(|found| Self::unless_natural(what, found))
     }
@@ -130,8 +126,8 @@ impl InvalidState {
     }
 }
 
-/// Largest number of cells (series elements) of a pack. With 1,024 cells, the 11-bit field of the alarm frame can hold
-/// a cell number or "the whole pack".
+/// Largest number of cells (series elements) of a pack. The 11-bit field of the alarm frame holds a cell or "the whole
+/// pack".
 pub const MAX_CELLS: usize = 1024;
 
 /// Index of a cell in the pack, from 0. Displays and DBC patterns may count from 1.
@@ -140,7 +136,7 @@ pub const MAX_CELLS: usize = 1024;
 pub struct CellIndex(pub u16);
 
 impl CellIndex {
-    /// Returns the index into per-cell arrays.
+    /// Index into per-cell arrays.
     pub const fn index(self) -> usize {
         self.0 as usize
     }
@@ -152,7 +148,7 @@ impl CellIndex {
 pub struct BusIndex(pub u8);
 
 impl BusIndex {
-    /// Returns the index into per-interface arrays.
+    /// Index into per-interface arrays.
     pub const fn index(self) -> usize {
         self.0 as usize
     }
@@ -164,24 +160,24 @@ impl BusIndex {
 pub struct SensorIndex(pub u16);
 
 impl SensorIndex {
-    /// Returns the index into per-sensor arrays.
+    /// Index into per-sensor arrays.
     pub const fn index(self) -> usize {
         self.0 as usize
     }
 }
 
-/// The input that a configured signal provides.
+/// The input that a signal provides.
 ///
 /// Readings of one frame are processed in the order of the variants. A voltage triggers the estimator, so current and
-/// temperature of the same frame come first.
+/// temperature come first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Channel {
-    /// State of the pack's contactors. When they are open, no current flows.
+    /// State of the contactors. No current flows while they are open.
     Contactor,
     /// Direction of a current that is sent as a magnitude: 1 = discharge, -1 = charge.
     CurrentDirection,
-    /// Pack current (A); positive = discharge, after the configured sign was applied.
+    /// Pack current (A), positive = discharge.
     Current,
     /// A temperature sensor (degrees C).
     Temperature(SensorIndex),
@@ -189,64 +185,59 @@ pub enum Channel {
     PackVoltage,
     /// One cell's voltage (V).
     CellVoltage(CellIndex),
-    /// SOC reported by the pack, fraction. The value is only compared with the estimate; the estimate never uses it.
+    /// SOC reported by the pack, fraction. It is only compared with the estimate.
     ReportedSoc,
-    /// SOH (capacity over rated capacity) reported by the pack, fraction. The value is only compared with the estimate;
-    /// the estimate never uses it.
+    /// SOH reported by the pack (capacity over rated capacity), fraction. It is only compared with the estimate.
     ReportedSoh,
-    /// Voltage of the vehicle's 12 V (or 24 V) supply (V). If this voltage is too low, no diagnostic requests are sent.
-    /// Never used by an estimate.
+    /// The vehicle's 12 V or 24 V supply (V). If it is too low, no diagnostic requests are sent.
     SupplyVoltage,
-    /// Whether the BMS bleeds a cell; 0 = the BMS does not bleed the cell. Only the cell-fault detector uses this
-    /// value.
+    /// Whether the BMS bleeds a cell; 0 = no. For the cell-fault detector only.
     Balancing(CellIndex),
-    /// Serial number of the pack, or another number that identifies the pack.
+    /// Serial number or another number that identifies the pack.
     PackIdentity,
 }
 
-/// Reason why a reading cannot be used. A bad reading is data, not an error.
+/// Why a reading cannot be used. A bad reading is data, not an error.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Fault {
-    /// The frame carries fewer bytes than the signal needs.
+    /// The frame is shorter than the signal needs.
     ShortFrame,
-    /// The frame failed the end-to-end check: damaged, repeated, out of sequence, or the first frame of a sequence.
+    /// The end-to-end check failed: damaged, repeated, out of sequence, or the first frame of a sequence.
     EndToEnd,
     /// The sender marks the signal as not available.
     NotAvailable,
-    /// The value is NaN or infinite on the wire (IEEE float signals).
+    /// NaN or infinite (IEEE float signals).
     NotFinite,
-    /// The value is outside the range that the DBC or the configuration gives.
+    /// Outside the range of the DBC or the configuration.
     OutOfRange,
-    /// The value changed faster than the configured rate allows.
+    /// Faster change than the configured rate allows.
     RateTooHigh,
-    /// The value did not change for a long time although it should have changed.
+    /// No change for a long time although the value should have changed.
     Stuck,
-    /// There was no value for longer than the configured age.
+    /// No value for longer than the configured age.
     Stale,
 }
 
-/// One value decoded from a frame, in the program's units and sign, or the fault that prevents it.
+/// One value decoded from a frame, in the program's units and sign, or the fault that makes the value unusable.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Reading {
-    /// The input that the reading belongs to.
     pub channel: Channel,
-    /// The value, or the fault that makes it unusable.
     pub value: Result<f64, Fault>,
 }
 
-/// Operating mode: sign of the current after dead band, hysteresis and minimum duration.
+/// Sign of the current after dead band, hysteresis and minimum duration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Mode {
-    /// No reading of the current has arrived yet, or the latest reading is stale.
+    /// No current reading yet, or the latest reading is stale.
     #[default]
     Unknown,
-    /// The current is negative, beyond the dead band.
+    /// Negative, beyond the dead band.
     Charge,
-    /// The current is inside the dead band.
+    /// Inside the dead band.
     Rest,
-    /// The current is positive, beyond the dead band.
+    /// Positive, beyond the dead band.
     Discharge,
 }
 

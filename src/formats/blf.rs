@@ -1,8 +1,9 @@
-//! Vector BLF (binary logging format): a header with the start date, then objects, usually in compressed containers.
+//! Reads Vector BLF files (binary logging format). A file has a header with the start date, then objects, which are
+//! usually in compressed containers.
 //!
-//! The containers make up one stream of objects: an object may continue in the next container. A damaged container or
-//! object costs only itself; reading continues at the next object mark. Sources: the field layout that Vector publishes
-//! with its `binlog` interface, compared with the files that python-can writes.
+//! The containers make up one stream of objects: an object may continue in the next container. After a damaged
+//! container or object, reading continues at the next object mark. Sources: the field layout that Vector publishes with
+//! its `binlog` interface, compared with the files that python-can writes.
 
 mod container;
 mod object;
@@ -25,10 +26,10 @@ const MARK: &[u8] = b"LOBJ";
 const HEADER_FIELDS: usize = 56;
 /// Size of an object's first part, bytes.
 const OBJECT_HEAD: usize = 16;
-/// Objects that are longer must be damaged, bytes. Recorders write images and packets of at most a few MiB.
+/// Maximum size of an object, bytes. A longer object must be damaged, because recorders write images and packets of at
+/// most a few MiB.
 const MAX_OBJECT: usize = 16 << 20;
 
-/// Reads a BLF file.
 pub(crate) struct BlfReader {
     objects: ByteStream<Containers>,
     start_ns: i64,
@@ -69,7 +70,7 @@ impl BlfReader {
         }
         let mut head = self.objects.fill(OBJECT_HEAD)?;
         if !head.starts_with(MARK) {
-            // Objects are padded to a multiple of four bytes, some by other rules.
+            // Writers pad objects with zeros, most of them to a multiple of four bytes.
             let first = &head[..head.len().min(OBJECT_HEAD)];
             let padding = first.iter().take_while(|byte| **byte == 0).count();
             if padding == first.len() {
@@ -112,7 +113,7 @@ impl BlfReader {
 impl LogReader for BlfReader {
     fn next_item(&mut self) -> io::Result<Option<Item>> {
         match self.next_object() {
-            // A container is damaged: the object that continues in it is lost, the next container may be good.
+            // If a container is damaged, an object that continues in it is lost. The next container may be intact.
             Err(error) if error.kind() == io::ErrorKind::InvalidData => {
                 self.objects.clear();
                 self.is_lost = true;

@@ -1,11 +1,10 @@
-//! A window over a stream of bytes: parsers look at the next bytes without owning them.
+//! A window over a stream of bytes. Parsers read the next bytes from it without copying them.
 
 use std::io::{self, Read};
 
-/// Size of the window, bytes. Longer parts of a file are skipped, not held.
+/// Size of the window, bytes. Longer parts of a file can only be skipped.
 pub(crate) const WINDOW: usize = 128 * 1024;
 
-/// Reads a source through a window of constant size.
 pub(crate) struct ByteStream<R> {
     source: R,
     window: Box<[u8]>,
@@ -19,7 +18,7 @@ impl<R: Read> ByteStream<R> {
         Self { source, window: vec![0; WINDOW].into_boxed_slice(), start: 0, end: 0, offset: 0 }
     }
 
-    /// The next bytes: at least `len` (at most [`WINDOW`]); fewer only at the end of the source.
+    /// Returns at least the next `len` bytes, or fewer at the end of the source. `len` must be at most [`WINDOW`].
     ///
     /// # Errors
     /// Fails if the source cannot be read. The bytes already in the window remain.
@@ -68,8 +67,8 @@ impl<R: Read> ByteStream<R> {
         Ok(true)
     }
 
-    /// Moves to the next place, at least `from` bytes ahead, where the stream contains `mark`. Returns whether there is
-    /// one.
+    /// Moves to the next position, at least `from` bytes ahead, where the stream contains `mark`. Returns whether there
+    /// is one.
     pub(crate) fn find(&mut self, from: usize, mark: &[u8]) -> io::Result<bool> {
         self.skip(from as u64)?;
         loop {
@@ -86,7 +85,7 @@ impl<R: Read> ByteStream<R> {
         }
     }
 
-    /// Forgets the bytes in the window.
+    /// Skips the bytes in the window.
     pub(crate) fn clear(&mut self) {
         self.consume(self.end - self.start);
     }
@@ -120,12 +119,10 @@ pub(crate) fn u64_at(bytes: &[u8], at: usize) -> u64 {
     u64::from_le_bytes(part)
 }
 
-/// Error about the content of a file.
 pub(crate) fn damaged(what: impl Into<String>) -> io::Error {
     io::Error::new(io::ErrorKind::InvalidData, what.into())
 }
 
-/// Error about a file that ends too early.
 pub(crate) fn cut(what: impl Into<String>) -> io::Error {
     io::Error::new(io::ErrorKind::UnexpectedEof, what.into())
 }

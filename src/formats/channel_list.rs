@@ -30,7 +30,6 @@ impl ChannelList {
         Some(number)
     }
 
-    /// The channels.
     pub(crate) fn as_slice(&self) -> &[Channel] {
         &self.0
     }

@@ -1,9 +1,9 @@
-//! Names files that people bring but packwatch cannot read, and a tool that converts each.
+//! Recognises common file formats that packwatch cannot read, and names a tool that converts each of them.
 
 /// Number of bytes before the magic of a TAR archive.
 const TAR_MAGIC_AT: usize = 257;
 
-/// Converter of text logs that few tools write.
+/// Advice for text logs that few tools write.
 const VIA_SAVVYCAN: &str = "open it in SavvyCAN and save it as GVRET CSV";
 
 /// Finds the format of a file that packwatch cannot read from its first bytes (at least 512). Returns the name of the

@@ -72,7 +72,7 @@ impl Format {
         Self::PcapNg,
     ];
 
-    /// Number of bytes from which [`recognise`](Self::recognise) finds every format.
+    /// Number of bytes that [`recognise`](Self::recognise) needs to find every format.
     pub const HEAD_BYTES: usize = 16 * 1024;
 
     /// Finds the format from the first bytes of a log (at most [`HEAD_BYTES`](Self::HEAD_BYTES) are needed). `None` =
@@ -121,7 +121,6 @@ impl Format {
     }
 }
 
-/// Finds a binary format.
 fn binary(head: &[u8]) -> Option<Format> {
     let begins = |magics: &[&[u8]]| magics.iter().any(|magic| head.starts_with(magic));
     if begins(&[blf::MAGIC]) {
@@ -135,7 +134,7 @@ fn binary(head: &[u8]) -> Option<Format> {
     }
 }
 
-/// A reader that returns nothing after the end or an error, whatever the format's reader would return.
+/// Wraps a reader, and returns nothing after the first end or error.
 struct UntilEnd {
     reader: Box<dyn LogReader>,
     has_ended: bool,

@@ -1,9 +1,9 @@
 //! Reads CAN logs of other tools as frames.
 //!
 //! In: the bytes of a file. Out: [`Item`]s in the order of the file, with their channel. [`Format::recognise`] finds
-//! the format from the first bytes; the file name plays no part. Every reader streams: its memory does not depend on
-//! the size of the file. A bad part costs only this part ([`Item::Bad`]). A file that ends too early, or whose
-//! structure is damaged, ends with an error after all frames before the damage.
+//! the format from the first bytes; the file name is not used. Every reader streams: its memory does not depend on the
+//! size of the file. A bad part becomes [`Item::Bad`], and reading continues after it. A file that ends too early, or
+//! whose structure is damaged, ends with an error after all frames before the damage.
 //!
 //! [`Mf4Writer`] writes frames as MF4, for other tools.
 //!
@@ -34,8 +34,8 @@ pub trait LogReader {
     /// Reads the next item. `None` = the log has ended.
     ///
     /// # Errors
-    /// Fails if the source cannot be read, or if the structure of the file is damaged so that nothing can be read after
-    /// this place. The message states what was found and what is allowed; the caller adds the file and
+    /// Fails if the source cannot be read, or if the structure of the file is so damaged that the rest cannot be read.
+    /// The message states what was found and what is allowed; the caller adds the file and
     /// [`position`](Self::position). Later calls return `None`.
     fn next_item(&mut self) -> io::Result<Option<Item>>;
 

@@ -1,9 +1,11 @@
-//! ASAM MDF 4 with bus logging: groups of records, one per kind of frame and channel, as CANedge and others write them.
+//! Reads ASAM MDF 4 files with bus logging, as CANedge and other tools write them. A file has a group of records for
+//! each kind of frame and each channel.
 //!
-//! Sorted groups are read in parallel and merged by their times. In unsorted data, records of several groups follow
-//! one another; they are returned in the order of the file. Unfinalized files, whose recorder lost its supply, are read
-//! up to their end. Damage to the data of one group does not end the others: it is reported after the last frame.
-//! Sources: ASAM MDF 4.1 and its bus-logging standard, as far as the files of CANedge, asammdf and python-can show them.
+//! Sorted groups are read in parallel and merged by their times. Unsorted data contain the records of several groups
+//! one after another; these are returned in the order of the file. Unfinalized files, whose recorder lost its supply,
+//! are read up to their end. If the data of one group are damaged, the other groups are still read, and the damage is
+//! reported after the last frame. Sources: ASAM MDF 4.1 and its bus-logging standard, as far as the files of CANedge,
+//! asammdf and python-can show them.
 
 mod blocks;
 mod data;
@@ -33,7 +35,7 @@ pub(crate) struct Mf4Reader {
     groups: Vec<GroupReader>,
     /// Next item of each group.
     next: Vec<Option<Stamped>>,
-    /// Groups by the time of their next item. The current group is not in it.
+    /// Groups by the time of their next item. The current group is not in the queue.
     queue: BinaryHeap<Reverse<(i64, usize)>>,
     current: Option<usize>,
     channels: ChannelList,
@@ -53,7 +55,7 @@ impl Mf4Reader {
         let file = match source.file {
             Some(file) => file,
             None => {
-                // An anonymous file that the system deletes.
+                // This anonymous file is deleted by the system.
                 let mut file = tempfile::tempfile()?;
                 let mut reader = source.reader;
                 io::copy(&mut reader, &mut file)?;
@@ -107,7 +109,8 @@ impl Mf4Reader {
         }
     }
 
-    /// The next item in time. As long as the current group is the earliest, it stays out of the queue.
+    /// Returns the next item in order of time. The current group is put into the queue only when another group is
+    /// earlier.
     fn next_stamped(&mut self) -> Option<Stamped> {
         if let Some(index) = self.current {
             let group = &mut self.groups[index];

@@ -1,8 +1,8 @@
-//! PCAP and PCAPNG: packet captures of SocketCAN by tcpdump, Wireshark and others.
+//! Reads PCAP and PCAPNG files: packet captures of SocketCAN by tcpdump, Wireshark and others.
 //!
-//! Packets of link type SocketCAN, and packets of the cooked link types of Linux whose protocol is CAN or CAN FD,
-//! become frames. Other packets are parts without a frame. Sources: the capture file formats and link types as
-//! published by the tcpdump group.
+//! Packets of the link type SocketCAN become frames. Packets of the cooked link types of Linux become frames if their
+//! protocol is CAN or CAN FD. Other packets give items without a frame. Sources: the capture file formats and link
+//! types as published by the tcpdump group.
 
 mod next_generation;
 mod packet;
@@ -41,13 +41,11 @@ impl Form {
     }
 }
 
-/// Reads a PCAP file.
 pub(crate) struct PcapReader {
     packets: ByteStream<Box<dyn Read>>,
     form: Form,
     link: Option<LinkType>,
     decoder: PacketDecoder,
-    /// Offset of the packet read last.
     at: u64,
 }
 
@@ -63,7 +61,7 @@ impl PcapReader {
         if head.len() < FILE_HEAD {
             return Err(cut(format!("the file ends in its header after {} bytes, must have {FILE_HEAD}", head.len())));
         }
-        // The upper bits state a frame check sequence.
+        // The upper bits describe a frame check sequence.
         let number = u32_at(head, 20, form.big_endian) & 0xFFFF;
         let link = LinkType::of_number(number);
         if link.is_none() {
@@ -104,7 +102,7 @@ impl PcapReader {
     }
 }
 
-/// Shows the decoder the first packets, so that it knows the byte order of the identifiers.
+/// Passes the first packets to the decoder, which infers the byte order of the identifiers.
 fn note_orders(mut packets: &[u8], form: Form, decoder: &mut PacketDecoder) {
     while let Some((head, rest)) = packets.split_at_checked(PACKET_HEAD)
         && let Some((packet, rest)) = rest.split_at_checked(u32_at(head, 8, form.big_endian) as usize)

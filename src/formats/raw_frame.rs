@@ -5,10 +5,9 @@ use packwatch_core::can::{CanId, Frame};
 /// Lengths that the codes 9 to 15 of CAN FD stand for, bytes.
 const FD_LENGTHS: [usize; 7] = [12, 16, 20, 24, 32, 48, 64];
 
-/// Fields of a frame before they are checked.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct RawFrame<'a> {
-    /// Number of the identifier, without marks.
+    /// Number of the identifier, without flags.
     pub(crate) id: u32,
     /// Whether the identifier has 29 bits.
     pub(crate) extended: bool,
@@ -16,7 +15,6 @@ pub(crate) struct RawFrame<'a> {
     pub(crate) remote: bool,
     /// CAN FD: bit rate switch and error state indicator.
     pub(crate) fd: Option<(bool, bool)>,
-    /// Payload.
     pub(crate) data: &'a [u8],
 }
 

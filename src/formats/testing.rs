@@ -6,7 +6,7 @@ use packwatch_core::can::{CanId, Frame};
 
 use crate::{Channel, Format, Item, Position, Source};
 
-/// What a reader returned: items, channels, and the error at the end with its place.
+/// Result of a reader: items, channels, and the error at the end with its position.
 #[derive(Debug)]
 pub(crate) struct ReadLog {
     pub(crate) items: Vec<Item>,
@@ -33,7 +33,6 @@ impl ReadLog {
     }
 }
 
-/// Reads a whole log from memory.
 pub(crate) fn read(bytes: &[u8]) -> ReadLog {
     let format = Format::recognise(bytes).expect("a known format");
     let source = Source { reader: Box::new(Cursor::new(bytes.to_vec())), file: None };

@@ -1,7 +1,7 @@
 //! Reads text logs: one item per line.
 //!
-//! Each format is a [`Grammar`], which reads a line; [`TextLog`] reads the lines of a log with it. A line that violates
-//! its grammar becomes [`Item::Bad`] with its column, and the next line is read as usual.
+//! Each format is a [`Grammar`], which parses one line. [`TextLog`] reads the lines of a log with a grammar. A line
+//! that violates the grammar becomes [`Item::Bad`] with its column, and the next line is read as usual.
 
 mod asc;
 mod busmaster;
@@ -26,12 +26,12 @@ use crate::{Channel, Format, Item, LogReader, Position};
 use cursor::{Cursor, Fault};
 use lines::{Line, Lines};
 
-/// Largest number of channels in a log, and longest name of a channel, bytes. An index has 8 bits; a name of Linux has
-/// at most 15 bytes.
+/// Maximum number of channels in a log, because an index has 8 bits. Maximum length of a channel's name, bytes; the
+/// name of a Linux interface has at most 15.
 const MAX_CHANNELS: usize = 256;
 const MAX_NAME: usize = 64;
 
-/// Reads the lines of a format.
+/// Parses the lines of a format.
 trait Grammar: Sized {
     /// Creates a reader for a log that begins with these bytes.
     ///
@@ -39,7 +39,7 @@ trait Grammar: Sized {
     /// Fails if the format cannot be read, although it is recognised.
     fn new(head: &[u8]) -> io::Result<Self>;
 
-    /// Whether no other format has such a line. `line` may be a line of any file.
+    /// Whether a line can belong only to this format. The line may come from any file.
     fn recognises(line: &[u8]) -> bool;
 
     /// What was assumed about the log.
@@ -155,8 +155,9 @@ struct Channels {
 }
 
 impl Channels {
-    /// Returns the place of a numbered channel in the list. `first` is the number of the log's first channel. A log that
-    /// begins with a smaller number counts from this number. `None` if there are too many channels.
+    /// Returns the position of a numbered channel in the list. `first` is the number from which such logs usually
+    /// count. If the first channel found has a smaller number, channels count from that number. `None` if there are too
+    /// many channels.
     #[inline]
     fn number(&mut self, written: u32, first: u32) -> Option<u8> {
         let is_known =
@@ -171,8 +172,8 @@ impl Channels {
         self.add(Channel::Number { written, index: written.saturating_sub(counts_from) })
     }
 
-    /// Returns the place of a named channel in the list. `None` if there are too many channels, or if the name is
-    /// longer than 64 bytes or contains other characters than visible ASCII.
+    /// Returns the position of a named channel in the list. `None` if there are too many channels, or if the name is
+    /// longer than 64 bytes or contains characters other than visible ASCII.
     #[inline]
     fn name(&mut self, name: &[u8]) -> Option<u8> {
         let is_known = |channel: &Channel| matches!(channel, Channel::Name(known) if known.as_bytes() == name);
@@ -192,7 +193,7 @@ impl Channels {
     }
 }
 
-/// What the readers say about a channel that [`Channels`] refuses.
+/// The expected content, for the fault about a channel that [`Channels`] refuses.
 const CHANNEL: &str = "a channel (at most 256 channels)";
 
 /// A sum of times; `None` beyond the range of [`Timestamp`].

@@ -1,6 +1,7 @@
-//! Opens and reads files that describe something: configurations, DBC files, cell models, states, keys. A device in their
-//! place could fill the memory, so at most [`MAX_BYTES`] are read, from regular files and from pipes (`<(command)` in a
-//! shell). A pipe without data does not block the program for ever.
+//! Opens and reads files of limited size: configurations, DBC files, cell models, states and keys.
+//!
+//! At most [`MAX_BYTES`] are read, and only from regular files and from pipes (`<(command)` in a shell), because a
+//! device could fill the memory. A pipe without data does not block the program for ever.
 
 use std::fs::{File, FileType, OpenOptions};
 use std::io::{self, Read as _};
@@ -13,9 +14,7 @@ use nix::libc::{EISDIR, O_NONBLOCK};
 /// Maximum size of a file, bytes. The DBC of a whole vehicle has 10 MB.
 pub const MAX_BYTES: u64 = 64 << 20;
 
-/// Longest wait for data of a pipe.
 const PIPE_LIMIT: Duration = Duration::from_secs(10);
-/// Time between two attempts to read from a pipe.
 const PIPE_RETRY: Duration = Duration::from_millis(10);
 
 /// Opens a regular file.
@@ -28,12 +27,12 @@ pub fn open(path: &Path) -> io::Result<File> {
     if kind.is_file() { Ok(file) } else { Err(unreadable(kind)) }
 }
 
-/// Why a folder, a device or a pipe is not read.
+/// The error for a path that is not a regular file.
 fn unreadable(kind: FileType) -> io::Error {
     if kind.is_dir() { io::Error::from_raw_os_error(EISDIR) } else { io::Error::other("is not a regular file") }
 }
 
-/// Opens anything without waiting.
+/// Opens a file of any kind without waiting.
 fn open_any(path: &Path) -> io::Result<File> {
     // Opening a named pipe would otherwise wait for a writer. The flag has no effect on a regular file.
     OpenOptions::new().read(true).custom_flags(O_NONBLOCK).open(path)
@@ -105,7 +104,7 @@ mod tests {
         assert!(std::process::Command::new("mkfifo").arg(&pipe).status().expect("started").success());
         assert_eq!(read(&pipe).expect("no writer"), b"");
         let mut writer = std::process::Command::new("sh");
-        // The shell also reads, so that opening does not wait; the text comes in two parts.
+        // The shell also reads, so that opening does not wait. The text comes in two parts.
         writer.args(["-c", "exec 3<>\"$0\"; echo ready; printf one >&3; sleep 0.1; printf two >&3; sleep 0.2"]);
         let mut writer = writer.arg(&pipe).stdout(std::process::Stdio::piped()).spawn().expect("started");
         let mut ready = [0; 5];

@@ -1,7 +1,5 @@
-//! The control socket. Over this socket, clients on the same computer list the alarms of a running daemon and send
-//! commands to it.
-//!
-//! The control socket is a Unix stream socket. Requests and answers are lines of JSON. Requests are answered in order:
+//! The control socket, a Unix stream socket. Clients on the same computer list the alarms of a running daemon over it
+//! and send commands. Requests and answers are lines of JSON. Requests are answered in order:
 //! ```text
 //! {"version":1,"request":"alarms"}                    {"version":1,"ok":true,"time":...,"alarms":[...],...}
 //! {"version":1,"request":"clear","rule":"soc_low"}    {"version":1,"ok":true,"changed":1,"refused":0,...}
@@ -34,7 +32,7 @@ pub use server::{ControlServer, PendingRequest};
 /// Maximum number of connections, enough for a person, a display and a script. Each connection is a task with a few
 /// kilobytes.
 pub const MAX_CONNECTIONS: usize = 8;
-/// Limits of the connections. One user cannot take all, and root always finds one.
+/// Limits of the connections. One user cannot take all slots, and one slot is reserved for root.
 pub(crate) const SLOTS: SlotLimits = SlotLimits { total: MAX_CONNECTIONS, for_root: 1, per_user: 6, per_client: 4 };
 /// Longest request, bytes, including the end of the line. The longest valid request has less than 200 bytes.
 pub const MAX_REQUEST_BYTES: usize = 4096;
@@ -45,7 +43,6 @@ pub const MAX_SILENCE: Duration = Duration::from_secs(10);
 /// in a few milliseconds. Further alarms are only counted.
 pub const MAX_LISTED: usize = 1024;
 
-/// File name of the socket in the daemon's runtime folder.
 const FILE_NAME: &str = "control.sock";
 /// File mode of the socket: owner and group may connect.
 const MODE: u32 = 0o660;

@@ -6,9 +6,9 @@
 //!   receive that format; other clients receive Prometheus' text format 0.0.4.
 //! * `/`: the live page; `/events`: its server-sent events; `/-/healthy`: a liveness check.
 //! * `/report`: the report of the daemon's store, if this program can make reports.
-//! * On the address of a network, the page and the events need a token ([`Access`]).
+//! * If the exporter listens on a network address, the page and the events require a token ([`Access`]).
 //! * [`http`] limits connections and request heads.
-//! * the signals of [`Stop`] stop the exporter cleanly.
+//! * The signals of [`Stop`] stop the exporter cleanly.
 
 mod access;
 mod live;
@@ -51,18 +51,18 @@ const ONLY_LOCAL: &str = "needs a token unless you open http://127.0.0.1 or http
 /// Makes the report of a store's folder; `None` = this program cannot make reports.
 pub type ReportMaker = Option<fn(&Path) -> Result<String, String>>;
 
-/// What all connections share.
+/// State that all connections share.
 struct Site {
     live: Rc<Live>,
     access: Access,
     page: String,
     report: ReportMaker,
-    /// One report is made at a time.
+    /// Held while a report is made, so that only one is made at a time.
     report_permit: Arc<Semaphore>,
 }
 
-/// Follows the daemon's status next to `socket` and serves it on the address `listen`, until a signal stops the
-/// exporter. `token_file` is the file with the token that clients must know.
+/// Follows the status of the daemon with the status socket `socket`, and serves it on the address `listen` until a
+/// signal stops the exporter. `token_file` is the file with the token that clients must know.
 ///
 /// # Errors
 /// Fails if the token cannot be read, or if the address cannot be bound.
@@ -120,7 +120,7 @@ async fn answer(request: &Request<Incoming>, site: &Site, activity: &Activity, e
         Decision::Allowed => {}
         Decision::SetCookie(cookie) => {
             let moved = respond(StatusCode::SEE_OTHER, PLAIN, "the token is accepted\n");
-            // Two slashes would begin the name of another host.
+            // A path that begins with two slashes would redirect to another host.
             let own = format!("/{}", path.trim_start_matches('/'));
             return with(with(moved, LOCATION, &own), SET_COOKIE, &cookie);
         }
@@ -148,7 +148,6 @@ fn respond(status: StatusCode, kind: &'static str, text: impl Into<Bytes>) -> An
     answer_with(status, kind, AnswerBody::Whole(Full::new(text.into())))
 }
 
-/// Makes the report of the daemon's store.
 async fn report(site: &Site) -> Answer {
     let Some(make) = site.report else { return respond(StatusCode::NOT_FOUND, PLAIN, NO_REPORT) };
     let store = site.live.document().await.and_then(|document| document.store);

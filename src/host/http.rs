@@ -33,7 +33,6 @@ pub(crate) const MAX_CONNECTIONS: usize = 16;
 const MAX_PER_ADDRESS: usize = 8;
 /// Longest head of a request, bytes. This is the smallest limit that hyper supports.
 const MAX_REQUEST_BYTES: usize = 8192;
-/// Maximum number of headers of a request.
 const MAX_HEADERS: usize = 64;
 /// Longest wait for the head of a request. A connection that is silent for longer is closed.
 const HEAD_LIMIT: Duration = Duration::from_secs(30);
@@ -42,13 +41,12 @@ const CONNECTION_LIMIT: Duration = Duration::from_secs(300);
 /// Time to finish the current answer when a connection reaches [`CONNECTION_LIMIT`]. By default, Prometheus waits this
 /// long for a scrape.
 const ANSWER_LIMIT: Duration = Duration::from_secs(10);
-/// Time to finish the current answers when the program stops.
 const DRAIN_LIMIT: Duration = Duration::from_secs(1);
 /// Pause after a connection could not be accepted.
 const ACCEPT_PAUSE: Duration = Duration::from_secs(1);
 
-/// Serves connections until a signal stops the program. `answer` gets a request, the activity of its connection, and
-/// the end of the connection's life. Must run in a `LocalSet`.
+/// Serves connections until a signal stops the program. Calls `answer` with each request, the activity of its
+/// connection, and the time at which the connection must end. Must run in a `LocalSet`.
 pub async fn serve<A, F, B>(listener: TcpListener, stop: &mut Stop, answer: A)
 where
     A: Fn(Request<Incoming>, Activity, Instant) -> F + Clone + 'static,
@@ -143,8 +141,8 @@ pub fn reads<B>(request: &Request<B>) -> bool {
     matches!(*request.method(), Method::GET | Method::HEAD)
 }
 
-/// Whether a request names this computer by a numeric address or as `localhost`. Otherwise a foreign page in a browser
-/// on this computer could read the answer under its own host name, if that name resolves to this computer (DNS
+/// Whether a request names this computer by a numeric address or as `localhost`. Without this check, a foreign web page
+/// in a browser on this computer could read the answer, because the page's host name may resolve to this computer (DNS
 /// rebinding).
 pub fn names_this_computer<B>(request: &Request<B>) -> bool {
     request.headers().get_all(HOST).iter().all(|host| host.to_str().is_ok_and(is_numeric))

@@ -1,7 +1,7 @@
 //! Sets up the program's log. If systemd has connected standard error to journald, lines are sent to journald with
-//! fields. Otherwise, lines are written to standard error.
+//! fields. Otherwise, lines are written to standard error as text. `limit` limits the number of lines per second.
 //!
-//! In both cases the number of lines is limited (`limit`). In: a filter from `--log`. Out: log lines.
+//! The filter comes from `--log` or from `PACKWATCH_LOG`; a filter that cannot be parsed is an error.
 
 mod journald;
 mod limit;
@@ -36,7 +36,6 @@ const MEMBER_CRATES: [&str; 4] = ["packwatch_core", "packwatch_host", "packwatch
 /// The MQTT library. It warns about every rejected message; the uplink logs each reason once.
 const MQTT_LIBRARY: &str = "rumqttc";
 
-/// Counts a line that was not logged.
 fn note_left_out() {
     LEFT_OUT.fetch_add(1, Ordering::Relaxed);
 }
@@ -53,7 +52,7 @@ pub fn take_left_out() -> u64 {
 pub fn start(filter: Option<&str>) -> Result<(), String> {
     let text = filter.map(str::to_owned).or_else(|| std::env::var(LOG_VARIABLE).ok()).unwrap_or_else(|| "info".into());
     let registry = tracing_subscriber::registry().with(targets(&text)?);
-    // A second start (in tests) keeps the first logger.
+    // If logging has already been started (in tests), the first logger stays.
     let _ = match stderr_is_journal().then(Journal::new) {
         Some(Ok(journal)) => registry.with(journal.with_filter(RateLimit::default())).try_init(),
         // Colours are used only on a terminal. An empty NO_COLOR counts as not set.
@@ -67,7 +66,7 @@ pub fn start(filter: Option<&str>) -> Result<(), String> {
     Ok(())
 }
 
-/// Formats the time of a line in UTC, to the microsecond. The timer of `tracing` is not used, because it calls
+/// Formats the time of a line in UTC, to the microsecond. The timer of `tracing` is not used because it calls
 /// `SystemTime::now`, which panics after 2038 on 32-bit processors with musl.
 struct WallClock;
 
@@ -77,11 +76,11 @@ impl FormatTime for WallClock {
     }
 }
 
-/// Parses a filter. `packwatch::MODULE` selects the module of that name in every member crate.
+/// Parses a filter. `packwatch::MODULE` selects this module in every member crate.
 fn targets(text: &str) -> Result<Targets, String> {
     let allowed = "must be error, warn, info, debug, trace or off, or a filter such as packwatch::io=debug,info";
     let filter: Targets = text.parse().map_err(|error| format!("log filter '{text}': {error}, {allowed}"))?;
-    // A single word that is not a level would select a module of that name, and nothing would be logged.
+    // A single word that is not a level would be taken for a module name, and nothing would be logged.
     let is_level = |word: &str| word.parse::<LevelFilter>().is_ok() || word.starts_with("packwatch");
     let mut words = text.split(',').map(str::trim).filter(|word| !word.is_empty() && !word.contains('='));
     if let Some(word) = words.find(|word| !is_level(word)) {

@@ -42,7 +42,6 @@ use rows::{write_estimate, write_estimates_header, write_frame};
 pub use summary::ReplaySummary;
 use summary::{note_event, peak_memory_kib};
 
-/// Number of records between two progress reports.
 const REPORT_EVERY: usize = 4096;
 
 /// Settings of a replay. The default replays everything as fast as possible and stores nothing.
@@ -207,7 +206,6 @@ pub fn play(
     Ok(sent)
 }
 
-/// The loop's state.
 struct Replay {
     monitor: Monitor,
     out: Outputs,
@@ -221,13 +219,12 @@ struct Replay {
     snapshot_at: Option<Timestamp>,
     snapshot: Option<Snapshot>,
     summary: ReplaySummary,
-    /// Whether a log is a journal.
     is_journal: bool,
     /// Whether the summary already notes a reload of the recorded run.
     reloaded: bool,
     learned: BTreeMap<CellIndex, RecordedValues>,
-    /// Counts before this replay: 0 without a restored state. With a restored state, `None` until the first input has
-    /// been handled.
+    /// Counts before this replay. They are 0 if no state was restored. If a state was restored, they are `None` until
+    /// the first input has been handled.
     before: Option<CountsBefore>,
 }
 
@@ -447,7 +444,7 @@ impl Replay {
         }
         let readings = self.monitor.reading_counts().since(&before.readings);
         let failure = failure::failure(&summary, &span, steps, &readings, &self.settings.interfaces);
-        // A journal records a run with this configuration, so a run without estimates is no wrong file.
+        // A journal was recorded with this configuration, so missing estimates do not mean that the file is wrong.
         match failure {
             Some(reason) if self.is_journal => summary.notes.push(reason),
             failure => summary.failure = failure,

@@ -126,7 +126,7 @@ impl Service {
         // The service runs as a spawned task, because waking the future of `block_on` itself costs a system call per
         // frame.
         let served = runtime.block_on(async { tokio::spawn(self.serve()).await });
-        // A running fit is abandoned and started again after the next start.
+        // A running fit of the cell model is abandoned, and started again after the next start.
         runtime.shutdown_background();
         served.unwrap_or_else(|stopped| std::panic::resume_unwind(stopped.into_panic()))
     }
@@ -206,7 +206,6 @@ impl Service {
     }
 }
 
-/// Logs whether commands from the bus are authenticated.
 fn log_commands(config: &Config) {
     match (&config.monitor.commands, crate::config::command_words(config)) {
         (None, _) => {}

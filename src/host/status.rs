@@ -43,7 +43,8 @@ use crate::io::connection_slots::SlotLimits;
 use crate::io::unix_socket::{client_folder, runtime_folder};
 
 /// Limits of the clients of both sockets together. A vehicle needs far fewer: a display, an exporter and a few scripts.
-/// Each client uses a descriptor and a few kilobytes. One user cannot take all slots, and root always finds one.
+/// Each client uses a descriptor and a few kilobytes. One user cannot take all slots, and four slots are reserved for
+/// root.
 const SLOTS: SlotLimits = SlotLimits { total: 64, for_root: 4, per_user: 40, per_client: 16 };
 /// Longest time that a client may take to read a document, and longest wait of a client for a fresh document.
 pub const MAX_SILENCE: Duration = Duration::from_secs(5);

@@ -1,12 +1,10 @@
 //! Limits how often an action may happen: a burst at once, then once per period.
 //!
-//! The store uses buckets to limit how many rows it writes about capacities, remaining life and filter resets;
-//! `logging` uses buckets to limit log lines. In: the time of each request. Out: whether the request is allowed. If a
-//! request has an earlier time than the previous request, no tokens are added.
+//! In: the time of each request. Out: whether the request is allowed. If a request has an earlier time than the
+//! previous request, no tokens are added.
 
 use crate::quantity::Timestamp;
 
-/// Burst and period of a bucket.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct BucketSize {
     /// Tokens of a full bucket.
@@ -15,7 +13,7 @@ pub(crate) struct BucketSize {
     pub(crate) period_s: f64,
 }
 
-/// The tokens left.
+/// A bucket of tokens. Each allowed action takes one.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct TokenBucket {
     size: BucketSize,
@@ -24,7 +22,6 @@ pub(crate) struct TokenBucket {
 }
 
 impl TokenBucket {
-    /// Creates a full bucket.
     pub(crate) const fn new(size: BucketSize) -> Self {
         Self { size, tokens: size.burst, filled: None }
     }

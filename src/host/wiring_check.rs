@@ -1,8 +1,8 @@
 //! Runs the two loops of `packwatch doctor`, which pass replayed logs or live input to the core's [`WiringObserver`]
 //! and, if the configuration is valid, also to a [`Monitor`].
 //!
-//! Listening is passive: nothing is sent. An [`Interrupt`] ends both loops early. The report then covers what was
-//! received until that time.
+//! Listening is passive: nothing is sent. An [`Interrupt`] ends both loops early, and the report covers the input so
+//! far.
 
 mod survey;
 mod trial;
@@ -66,7 +66,6 @@ impl Interrupt {
     }
 }
 
-/// The observer and the monitor.
 struct Session {
     observer: WiringObserver,
     monitor: Option<Monitor>,
@@ -196,7 +195,6 @@ fn no_records(logs: &[PathBuf], counts: &LogCounts) -> LogError {
     LogError::Data(format!("{}: no CAN frames; give a journal, a candump log or a CSV log{bad}", names.join(", ")))
 }
 
-/// A listener on one interface.
 struct BusListener {
     bus: BusIndex,
     name: String,
@@ -235,7 +233,7 @@ pub fn listen(
         received.sort_by_key(|record| record.time);
         received.drain(..).for_each(|record| session.feed(&record));
         each(CheckProgress { bytes: 0, frames: session.observer.frames(), seconds: began.elapsed().as_secs_f64() });
-        // A full bus delivers 80 frames in 10 ms, and the kernel buffers thousands.
+        // The kernel buffers thousands of frames, and a full bus delivers only 80 in 10 ms.
         std::thread::sleep(Duration::from_millis(10));
     }
     session.observer.handle_listened(began.elapsed().as_secs_f64());

@@ -7,8 +7,8 @@
 //! | `soc` | SOC, fraction; empty = not measured |
 //! | `cell` | number of the cell, from 0 |
 //! | `cycle` | number of the part of a measured file that the row describes |
-//! | `type` | kind of the cycle: `discharge` or another word |
-//! | `duration_s` | how long the cell was in use from the time of the row on (s) |
+//! | `type` | `discharge`, or another word for any other kind of cycle |
+//! | `duration_s` | time (s) in use after the time of the row |
 
 use std::borrow::Cow;
 use std::path::Path;
@@ -16,10 +16,8 @@ use std::path::Path;
 use crate::io::table::{Header, Row, Table, TableError};
 use crate::quantity::{CellIndex, Timestamp};
 
-/// The columns that state a capacity.
 const CAPACITY: [&str; 2] = ["capacity_ah", "capacity_ah_source"];
 
-/// A table being read.
 pub(crate) struct CapacityTable {
     table: Table,
     time: usize,
@@ -63,7 +61,6 @@ impl CapacityTable {
         Self::open_with(path, &[CAPACITY[0], CAPACITY[1], "soc"])
     }
 
-    /// Opens a table that has at least one of the columns `values`.
     fn open_with(path: &Path, values: &[&str]) -> Result<Self, TableError> {
         let table = Table::open(path)?;
         let header = table.header();
@@ -86,7 +83,6 @@ impl CapacityTable {
         Ok(Self { last: Some(Timestamp::from_nanos(i64::MIN)), ..Self::open(path)? })
     }
 
-    /// Names of the file and its columns.
     pub(crate) fn header(&self) -> &Header {
         self.table.header()
     }
@@ -94,8 +90,7 @@ impl CapacityTable {
     /// Returns the next row, or `None` at the end of the file.
     ///
     /// # Errors
-    /// The file cannot be read, or a field is wrong. The error names the file, line and column, what was found and what
-    /// is allowed.
+    /// The file cannot be read, or a field is wrong.
     pub(crate) fn next_row(&mut self) -> Result<Option<CapacityRow<'_>>, TableError> {
         let Some(row) = self.table.next_row()? else { return Ok(None) };
         let time = row.stamp(self.time)?;
@@ -112,7 +107,7 @@ impl CapacityTable {
             line: row.line,
             time,
             capacity_ah: number(self.capacity, f64::MIN_POSITIVE, f64::MAX, "Ah above 0 or nothing")?,
-            // The SOC may be slightly outside 0 to 1. The limit of 1.5 detects a column in percent.
+            // Measured SOC may be slightly outside 0 to 1. The limit of 1.5 detects a column in percent.
             soc: number(self.soc, -0.5, 1.5, "a fraction, 0 to 1")?,
             cell: self.cell.map(|column| cell(&row, column)).transpose()?,
             cycle: self.cycle.map_or_else(Cow::default, |column| row.text(column)),

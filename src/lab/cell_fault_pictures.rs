@@ -1,8 +1,8 @@
 //! Draws the results of a cell fault detector. For each estimated quantity, one picture shows how far each cell is from
 //! the median of its pack.
 //!
-//! A bar is a 95 % interval. A cell is red if the detector has reported one of the findings that the picture shows. The
-//! reported cells have a number; without a reported cell, the lowest and the highest cell have one.
+//! A bar is a 95 % interval. A cell is red if the detector has reported a finding that the picture shows. Only reported
+//! cells are numbered. Without a reported cell, the lowest and the highest cell are numbered.
 
 use crate::cell_faults::difference::{CAPACITY, CHANNEL, CONTACT, LEAK, RESISTANCE, SOC, STATES};
 use crate::cell_faults::fault;
@@ -14,22 +14,19 @@ use crate::quantity::CellIndex;
 /// Half of the width of a bar; 1 is the distance between two cells on the axis.
 const HALF_BAR: f64 = 0.3;
 
-/// Description of one picture.
 struct Shown {
     state: usize,
-    /// Name of the picture's file.
     name: &'static str,
     title: &'static str,
     label: &'static str,
-    /// Factor from the unit of the state to the unit of the axis label.
+    /// Factor from the unit of the state to the unit of `label`.
     scale: f64,
     /// Differences, in the unit of the state, at which a cell is reported.
     limits: &'static [f64],
-    /// Kinds of findings that this picture shows.
     kinds: &'static [CellFaultKind],
 }
 
-/// The pictures in the order of a report. The SOC is first, because it shows the most frequent difference.
+/// The pictures in the order of a report. The SOC is first because it shows the most frequent difference.
 const SHOWN: [Shown; STATES] = [
     Shown {
         state: SOC,
@@ -103,14 +100,14 @@ pub const NAMES: [&str; STATES] = {
     names
 };
 
-/// Returns all pictures, each with the name of its file.
+/// Returns all pictures with their file names.
 pub fn all(diagnosis: &CellFaultDetector) -> Vec<(String, Picture)> {
     let cells: Vec<[Option<ScalarGaussian>; STATES]> =
         (0..).map(CellIndex).map_while(|cell| diagnosis.relative(cell)).collect();
     SHOWN.iter().map(|shown| (shown.name.to_owned(), picture(shown, &cells, diagnosis.findings()))).collect()
 }
 
-/// Name and title of the pictures that show no finding, except the picture of the SOC.
+/// Returns name and title of the pictures that show no finding, except the picture of the SOC.
 pub fn quiet(diagnosis: &CellFaultDetector) -> Vec<(&'static str, &'static str)> {
     let has_finding = |shown: &Shown| diagnosis.findings().iter().any(|found| shown.kinds.contains(&found.kind));
     let quiet = SHOWN.iter().filter(|shown| shown.state != SOC && !has_finding(shown));
@@ -121,7 +118,7 @@ fn picture(shown: &Shown, cells: &[[Option<ScalarGaussian>; STATES]], findings: 
     let is_found = |cell: usize| {
         findings.iter().any(|found| shown.kinds.contains(&found.kind) && found.is_of(CellIndex(cell as u16)))
     };
-    // Number, value and half the width of the interval of each cell.
+    // Each entry has the cell number, the value, and half the width of the interval.
     let shown_of = |wanted: bool| {
         let of_one = move |(cell, states): (usize, &[Option<ScalarGaussian>; STATES])| {
             let size = states[shown.state].filter(|_| is_found(cell) == wanted)?;
@@ -165,7 +162,7 @@ fn picture(shown: &Shown, cells: &[[Option<ScalarGaussian>; STATES]], findings: 
     Picture::Chart(Chart { description, ..Chart::new(shown.title, axis, shown.label, layers) })
 }
 
-/// Cell and value of the reported cells, or of the lowest and the highest cell, at the outer end of the bar.
+/// Labels the reported cells or, without them, the lowest and the highest cell, at the outer end of the bar.
 fn labels(others: &[(f64, f64, f64)], found: &[(f64, f64, f64)]) -> Vec<Point> {
     let ends = || {
         let lowest = others.iter().min_by(|a, b| a.1.total_cmp(&b.1));

@@ -1,11 +1,10 @@
-//! Draws pictures as SVG: lines, bands (points) and thresholds over an axis of numbers or dates; bands of
-//! states.
+//! Draws pictures as SVG: lines, bands, points and thresholds over an axis of numbers or dates; states over time as
+//! bands.
 //!
-//! Input: values in the units that the labels name. Output: SVG in one style. A value that is not finite interrupts a
-//! line. Elements have CSS classes, and the page or file defines their colours for a light and a dark background
-//! ([`style`]). A long series is reduced to the lowest and highest value of each pixel column, so peaks stay visible
-//! and files stay small. Labels are outside the drawing area and never cover the data. Tool tips are `<title>` elements
-//! and need no script.
+//! A value that is not finite interrupts a line. Elements have CSS classes, whose colours the page or file defines for
+//! a light and a dark background ([`style`]). A long series is reduced to the lowest and highest value of each pixel
+//! column, so that peaks stay visible and files stay small. Labels never cover the data. Tool tips are `<title>`
+//! elements and need no script.
 
 mod axis;
 mod files;
@@ -22,7 +21,7 @@ pub use state_bands::{Span, StateBand, StateBands};
 pub use style::{Ink, variables};
 pub use svg::escape;
 
-/// Width and height of a picture, pixels.
+/// Width and height of a picture (pixels).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Size {
     pub width: f64,
@@ -44,7 +43,7 @@ pub enum Picture {
 }
 
 impl Picture {
-    /// Returns the elements inside the `<svg>`, and their height in pixels.
+    /// Returns the elements inside the `<svg>`, and their height (pixels).
     pub fn draw(&self, size: Size) -> (String, f64) {
         match self {
             Self::Chart(chart) => chart.draw(size),
@@ -60,7 +59,6 @@ impl Picture {
         }
     }
 
-    /// Returns the description for readers who cannot see the picture.
     fn description(&self) -> &str {
         match self {
             Self::Chart(chart) => &chart.description,

@@ -2,13 +2,11 @@
 //! battery controller's own SOC and SOH.
 //!
 //! Input: frames with times; optionally DBC files and definitions of diagnostic answers. Output: for each quantity,
-//! ranked candidates with their reasons in plain words. The search reads the answers to diagnostic requests, regardless
-//! of which device sent the requests. If no definition describes some bits of an answer, the search looks in these bits
-//! for consecutive cell voltages and for other fields. The search needs a bounded amount of memory and accepts any
-//! frames.
+//! ranked candidates with reasons in words. Answers to diagnostic requests are read regardless of the requesting
+//! device. Bits that no definition describes are searched for consecutive cell voltages and other fields.
 //!
-//! The owner must confirm the result, because names can mislead and a parked car shows little. If a field has no
-//! definition, its scale is guessed from plausible values.
+//! The owner must confirm the result, because names can mislead and a parked car shows little. The scale of a field
+//! without a definition is guessed from plausible values.
 
 mod capture;
 mod configuration;
@@ -57,7 +55,7 @@ pub struct Candidate {
     pub rank: usize,
     /// Interface on which the signal was received.
     pub interface: String,
-    /// `Message.Signal`; the name of a group contains `{n}` in place of the number.
+    /// `Message.Signal`. The name of a group contains `{n}` in place of the number.
     pub signal: String,
     /// Number of signals of the group; 1 = a single signal.
     pub signals: usize,
@@ -65,7 +63,7 @@ pub struct Candidate {
     pub low: f64,
     /// Largest value.
     pub high: f64,
-    /// Weight of the evidence; only the order of candidates matters.
+    /// Weight of the evidence. Only the order of candidates matters.
     pub points: f64,
     /// Direction of a positive current, found from the response of the voltage; `None` = unknown, or not a current.
     pub positive: Option<PositiveDirection>,
@@ -84,13 +82,13 @@ pub struct Discovery {
     pub frames: u64,
     /// Number of frames that were ignored because the log has too many identifiers.
     pub ignored_frames: u64,
-    /// Number of different diagnostic answers in the log (sender, service and identifier).
+    /// Number of different diagnostic answers (sender, service and identifier).
     pub answers: usize,
     /// Length of the log (s).
     pub seconds: f64,
     /// Number of signals with values in the log.
     pub signals: usize,
-    /// Remarks on battery voltages and currents that are described but never have a valid value in the log.
+    /// Remarks on described battery voltages and currents that never have a valid value.
     pub remarks: Vec<String>,
     #[serde(skip)]
     log_signals: Vec<LogSignal>,
@@ -128,7 +126,7 @@ impl Discoverer {
         Ok(())
     }
 
-    /// Sets what the owner knows from the pack's label. The label decides scales that the values leave open.
+    /// Sets the data on the pack's label. The label decides scales that the values do not determine.
     pub fn set_label(&mut self, label: PackLabel) {
         self.descriptions.label = label;
     }
@@ -166,7 +164,7 @@ impl Discoverer {
     /// Writes a configuration that uses the best candidates of [`finish`](Self::finish).
     ///
     /// # Errors
-    /// Some questions are answered neither by the log nor by the settings. The error lists them, one per line.
+    /// Neither the log nor the settings answer some questions. The error lists them, one per line.
     pub fn configuration(&self, discovery: &Discovery, settings: &PackSettings) -> Result<PackConfiguration, LabError> {
         let Self { capture, descriptions } = self;
         let writer = Writer { discovery, capture, descriptions, settings };

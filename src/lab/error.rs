@@ -1,4 +1,4 @@
-//! Defines the errors of offline commands. The text of an error states the place, what was found and what is allowed.
+//! Defines the errors of offline commands. An error text states the place, what was found and what is allowed.
 
 use std::path::Path;
 
@@ -8,18 +8,18 @@ use crate::chart::PlotError;
 use crate::config::ConfigFaults;
 use crate::io::table::TableError;
 
-/// Why an offline command failed; one line per fault.
+/// Reason why an offline command failed; one line per fault.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum LabError {
     /// Data or arguments that cannot be used.
     #[error("{0}")]
     Data(String),
-    /// The operating system cannot read or write a file.
+    /// A file that the operating system cannot read or write.
     #[error("{0}")]
     File(String),
 }
 
-/// Why a request was rejected.
+/// Reason why a request was rejected.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum RequestError {
     /// The configuration is faulty; one line per fault.
@@ -30,7 +30,7 @@ pub enum RequestError {
     Lab(#[from] LabError),
 }
 
-/// Implements the conversion of errors whose text already names the place.
+/// Converts errors whose text already names the place.
 macro_rules! convert {
     ($variant:ident: $($error:ty),+ $(,)?) => {
         $(impl From<$error> for LabError {
@@ -58,13 +58,11 @@ impl LabError {
     }
 }
 
-/// Creates a folder for results, and its parent folders if they are missing.
 pub(crate) fn create_folder(folder: &Path) -> Result<(), LabError> {
     std::fs::create_dir_all(folder)
         .map_err(|error| LabError::File(format!("{}: cannot be created: {error}", folder.display())))
 }
 
-/// Returns an error for the first value that is not allowed.
 pub(crate) fn check_values(
     name: &str,
     values: impl IntoIterator<Item = f64>,

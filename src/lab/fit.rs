@@ -1,9 +1,8 @@
-//! Fits a cell model to measured files: the work of `packwatch fit` without the terminal.
+//! Fits a cell model to measured files: `packwatch fit` without its terminal output.
 //!
 //! Input: measured CSV files ([`super::measured`]), slow tests (discharges so slow that they show the open-circuit
-//! voltage), and the data of the cell from the command line. Output: a [`FitOutcome`] with the tables of the model, the
-//! residuals of each file, and all values for the TOML file ([`toml`]). If the SOC of some files cannot be determined,
-//! a single error lists these files with the reasons.
+//! voltage), and the data of the cell from the command line. One error lists all files whose SOC cannot be determined,
+//! with the reasons.
 
 mod cells;
 mod chemistry;
@@ -47,7 +46,7 @@ use crate::io::csv_log::{CsvOptions, TableReading};
 
 /// Smallest share of the SOC range that the data must cover.
 const MIN_SOC_RANGE: f64 = 0.5;
-/// Default SOC breakpoints. They are closer together where the open-circuit voltage (OCV) bends.
+/// Default SOC breakpoints, closer together where the open-circuit voltage (OCV) bends.
 const SOC_NODES: [f64; 24] = [
     0.0, 0.025, 0.05, 0.075, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85,
     0.9, 0.95, 0.975, 1.0,
@@ -59,8 +58,7 @@ const AGEING_SOC_NODES: [f64; 25] = [
     0.0, 0.03, 0.045, 0.06, 0.075, 0.09, 0.105, 0.12, 0.14, 0.17, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.75, 0.8, 0.85,
     0.9, 0.93, 0.96, 0.98, 1.0,
 ];
-/// Width of the SOC interval above the cut-off. The curve of an ageing cell continues below the cut-off with the slope
-/// of this interval.
+/// Width of the SOC interval above the cut-off. Its slope continues the curve of an ageing cell below the cut-off.
 const LOW_END_SOC: f64 = 0.03;
 /// Initial time constants (s) for models with 1, 2 and 3 branches.
 const TAU_S: [&[f64]; 3] = [&[60.0], &[10.0, 150.0], &[5.0, 50.0, 500.0]];
@@ -68,9 +66,9 @@ const TAU_S: [&[f64]; 3] = [&[60.0], &[10.0, 150.0], &[5.0, 50.0, 500.0]];
 /// Temperature at which the electrodes are identified, degrees Celsius.
 const ELECTRODES_C: f64 = 25.0;
 
-/// Default shift of the open-circuit curve of an ageing cell (see `AgedOcv::of_shift`). With a shift of 0, the curve
-/// shrinks evenly; a shift of 1 is a pure loss of lithium. No fit of a new cell determines the shift, so this value is
-/// a prior. The value was chosen on the measured lives of two cells.
+/// Default shift of the open-circuit curve of an ageing cell (see `AgedOcv::of_shift`). With 0, the curve shrinks
+/// evenly; 1 is a pure loss of lithium. The value is a prior, because no fit of a new cell determines it. It was chosen
+/// on the measured lives of two cells.
 pub const AGEING_SHIFT: f64 = 0.5;
 
 /// Progress of the fit, for a progress bar.
@@ -98,7 +96,6 @@ pub struct FileResidual {
 }
 
 impl FileResidual {
-    /// Residuals of the records of the file at `path`.
     fn of(path: &Path, records: &[Record], tables: &ParameterTables) -> Self {
         Self {
             path: path.to_owned(),
@@ -113,13 +110,13 @@ impl FileResidual {
 /// A fitted model with its provenance and quality.
 #[derive(Debug, Clone)]
 pub struct FitOutcome {
-    /// Fitted tables, and the residual over all records.
+    /// Tables, and the residual over all records.
     pub fit: FittedTables,
     /// Capacity (Ah).
     pub capacity_ah: f64,
     /// Lowest and highest voltage (V).
     pub voltage_v: (f64, f64),
-    /// Electrodes that explain the open-circuit curve; `None` = no known electrodes explain it, a shift of the curve is
+    /// Electrodes that explain the open-circuit curve. `None` = no known electrodes explain it, a shift of the curve is
     /// given, or a fit to measured files has no slow test.
     pub electrodes: Option<FittedElectrodes>,
     /// Thermal parameters; `None` = the data do not determine them.
@@ -132,9 +129,9 @@ pub struct FitOutcome {
     pub by_kind: Option<(Residual, Residual)>,
     /// Residuals of each file; slow tests come last.
     pub files: Vec<FileResidual>,
-    /// What was read of each file.
+    /// Interpretation of each file's columns.
     pub tables: Vec<TableReading>,
-    /// The fitted records, in the order of the files; for plots.
+    /// The fitted records in the order of the files, for plots.
     pub records: Vec<Record>,
     /// For each record, the index of its file in `files`.
     pub file_of_record: Vec<usize>,
@@ -206,7 +203,7 @@ pub fn run(request: &FitRequest, mut progress: impl FnMut(FitProgress)) -> Resul
     Ok(outcome)
 }
 
-/// Returns the electrodes of the fitted curve, if the ageing of the curve can be computed from them.
+/// Returns the electrodes of the fitted curve, if they determine how the curve ages.
 fn ageing_electrodes(fitted: &FittedTables, capacity_ah: f64) -> Option<FittedElectrodes> {
     let soc = &fitted.grid.soc;
     let rows: Vec<Vec<f64>> = fitted.tables.ocv_v.chunks(soc.len()).map(<[f64]>::to_vec).collect();
@@ -214,10 +211,10 @@ fn ageing_electrodes(fitted: &FittedTables, capacity_ah: f64) -> Option<FittedEl
         .filter(|found| AgedOcv::of_electrodes(&found.electrodes, soc, capacity_ah, &rows).is_some())
 }
 
-/// Extends the open-circuit curve of an ageing cell below the cut-off of its discharges, where data are missing. The
-/// extension is a straight line with the slope of the curve in the lowest [`LOW_END_SOC`] of SOC above the cut-off.
-/// Without the extension, the last rows under load would make the curve so steep that the estimator's innovation gates
-/// reject the voltages of an aged cell's first rest.
+/// Extends the open-circuit curve of an ageing cell below the cut-off, where data are missing. The extension is a
+/// straight line with the slope of the lowest [`LOW_END_SOC`] above the cut-off. Without it, the last rows under load
+/// would make the curve too steep. The estimator's innovation gates would then reject the voltages of an aged cell's
+/// first rest.
 fn continue_low_end(fitted: &mut FittedTables) {
     let soc = &fitted.grid.soc;
     let cut_off = soc.partition_point(|&node| node < ageing::SOC_LEFT);
@@ -235,7 +232,6 @@ fn judged<'a>(records: &'a [Record], file_of_record: &[usize]) -> Vec<WeightedRe
     each.map(|(record, &file)| WeightedRecord { record, file, share: record::share(record) }).collect()
 }
 
-/// Reads the files and the slow tests on all cores.
 fn read_all(
     request: &FitRequest,
     progress: &mut impl FnMut(FitProgress),
@@ -268,8 +264,8 @@ fn settings(request: &FitRequest, prepared: &prepare::FitInputs) -> FitSettings 
         tau_s,
         voltage_v: prepared.voltage_v,
         ocv: prepared.ocv.clone(),
-        // Smallest slope of the OCV of an ageing cell. Without this limit, relaxation that is slower than the branch
-        // would bend the top of the curve down.
+        // Without a minimum slope, relaxation that is slower than the branch would bend the top of an ageing cell's OCV
+        // down.
         min_slope_v: if ageing { [(0.0, 0.2), (0.9, 1.0)].to_vec() } else { vec![] },
         deviations,
     }

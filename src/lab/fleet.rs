@@ -1,10 +1,10 @@
-//! Processes many logs at once. [`whatif`] evaluates the alarms under other settings, [`export`] writes the results as
-//! tables, and [`vehicles`] writes the same tables for a fleet of vehicles on several machines. [`prior`] combines what
-//! the vehicles of a fleet have learned about their cells.
+//! Processes many logs at once. [`whatif`] evaluates the alarms under other settings. [`export`] writes the results as
+//! tables. [`vehicles`] writes the same tables for a fleet of vehicles on several machines. [`prior`] combines what the
+//! vehicles have learned about their cells.
 //!
-//! Input: a configuration, and logs in any format that `replay` reads. Each log is replayed separately (in a fleet, all
-//! logs of a vehicle together), and all cores are used. If a log cannot be replayed, the error is reported and the
-//! other logs continue. Memory depends on the size of the results of a log, not on the length of the log.
+//! Input: a configuration, and logs in any format that `replay` reads. Each log is replayed separately, but a fleet
+//! replays all logs of a vehicle together. All cores are used. If a log cannot be replayed, the error is reported and
+//! the other logs continue.
 
 pub mod drive;
 pub mod export;
@@ -36,6 +36,6 @@ pub fn in_parallel<T: Sync, R: Send>(
     let threads = jobs.unwrap_or(0).min(items.len().max(1));
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
     let pool = pool.map_err(|error| LabError::Data(format!("threads cannot be started: {error}")))?;
-    // Each thread takes one item at a time, because the lengths of logs differ greatly.
+    // Each thread takes one log at a time, because the lengths of logs differ greatly.
     Ok(pool.install(|| items.par_iter().enumerate().with_max_len(1).map(|(index, item)| work(index, item)).collect()))
 }

@@ -2,9 +2,8 @@
 //! pictures.
 //!
 //! [`ColumnTable`] reads columns of CSV files. [`cross_validate`] cross-validates one kernel on a table.
-//! [`TrainedModel`] is a model that can be saved and loaded, with the names of its columns. [`forecast`] predicts
-//! future rows from past rows, without future inputs. The arithmetic is in [`crate::regress`]. This module prints
-//! nothing.
+//! [`TrainedModel`] is a model with the names of its columns that can be saved and loaded. [`forecast`] predicts future
+//! rows from past rows, without future inputs. The arithmetic is in [`crate::regress`].
 
 pub mod forecast;
 mod pictures;
@@ -31,9 +30,9 @@ pub struct CrossValidation {
     pub folds: Folds,
     /// Errors over all rows.
     pub score: PredictionScore,
-    /// Duration of the cross-validation of this kernel (s).
+    /// Duration of the cross-validation (s).
     pub seconds: f64,
-    /// Peak memory of the process during the cross-validation, KiB; `None` = the system does not report it.
+    /// Peak memory of the process during the cross-validation (KiB); `None` = the system does not report it.
     pub peak_kib: Option<u64>,
 }
 
@@ -94,19 +93,17 @@ fn write_csv(path: &Path, heads: Vec<String>, rows: impl Iterator<Item = Vec<Str
     Ok(file.finish()?)
 }
 
-/// Formats a prediction: mean, standard deviation, and both ends of the interval.
 fn interval(p: &Prediction) -> [String; 4] {
     [p.mean, p.measurement_variance.sqrt(), p.low_95, p.high_95].map(|number| number.to_string())
 }
 
-/// Resets the peak memory that the operating system has recorded, so that the next peak belongs to the next
-/// Gaussian-process kernel. If this fails, the recorded peaks cover the time since the process started and are still
-/// upper bounds.
+/// Resets the recorded peak memory, so that the next peak belongs to the next kernel. If this fails, the peaks are
+/// upper bounds because they cover the time since the process started.
 fn reset_peak() {
     let _ = std::fs::write("/proc/self/clear_refs", "5");
 }
 
-/// Returns the peak memory of the process, KiB (VmHWM of /proc/self/status).
+/// Returns the peak memory of the process in KiB (VmHWM of /proc/self/status).
 pub fn peak_kib() -> Option<u64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
     status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?.trim().strip_suffix("kB")?.trim().parse().ok()

@@ -1,7 +1,6 @@
 //! Converts descriptions of a car's signals or of a cell from other formats to parts of a packwatch configuration.
 //!
-//! Input: the text of a file. Output: TOML that a person can read and edit, and a list of the parts that were left out,
-//! each with its path in the file and the reason. This module reads and writes no files.
+//! Parts of the file that cannot be converted are listed with their path in the file and the reason.
 
 pub mod bpx;
 pub mod dbc;
@@ -23,7 +22,7 @@ pub struct ImportResult {
     pub exclusions: Vec<Exclusion>,
     /// Unknown fields that were ignored, each with its path and name.
     pub warnings: Vec<String>,
-    /// Number of converted signals. In a numbered series, each signal counts.
+    /// Number of converted signals, counting each signal of a numbered series.
     pub signals: usize,
 }
 
@@ -38,7 +37,7 @@ pub struct Exclusion {
     pub detail: String,
 }
 
-/// Why a part of the file was left out.
+/// Reason why a part of the file was left out.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum ExclusionReason {
     /// The command exists only in other model years.

@@ -1,9 +1,8 @@
 //! Reads the files of a cycler with time, current, voltage, temperature and ampere-hours.
 //!
-//! In: a table in a form that [`CsvLog`] reads, of one cell. Out: the parts of the file. The time restarts at each new
-//! value of the part column (`cycle`, `segment` or `ref`). The column `type` names the kind of a part. An empty field
-//! becomes NaN, except the time. Rows with an empty time, or a field that is not a number, are left out and counted. If
-//! more than 1 % of the rows are, the first of them is the error.
+//! Time restarts at each new value of the part column (`cycle`, `segment` or `ref`). The column `type` names the kind
+//! of a part. An empty field becomes NaN. Rows without a time, or with a field that is not a number, are left out and
+//! counted. If more than 1 % of the rows are left out, reading fails with the error of the first of these rows.
 
 use std::path::{Path, PathBuf};
 
@@ -22,7 +21,7 @@ pub struct MeasuredFile {
     pub parts: Vec<MeasuredPart>,
     /// Whether the file is in the Battery Data Format.
     pub is_bdf: bool,
-    /// What was read as what.
+    /// Interpretation of the columns.
     pub reading: TableReading,
 }
 
@@ -31,14 +30,14 @@ impl MeasuredFile {
     ///
     /// # Errors
     /// The file cannot be read, a column is missing, a field is not a number, values cannot be in their unit, or the
-    /// file has no rows. The error states the place and what was found.
+    /// file has no rows.
     pub fn read(path: &Path, options: &CsvOptions) -> Result<Self, TableError> {
         let mut log = CsvLog::open_path(path, &CsvOptions { cells: 1, sensors: 1, series: 1, ..options.clone() })?;
         let mut parts: Vec<MeasuredPart> = Vec::new();
         let mut first_bad = None;
         while let Some(row) = log.next_row()? {
             match row {
-                // A division gives the number that the file states; `Timestamp::secs` may differ in the last bit.
+                // The division gives exactly the number in the file. `Timestamp::secs` may differ in the last bit.
                 Ok(row) => add_row(row.time.nanos() as f64 / 1e9, &log, &mut parts),
                 Err(error) => first_bad = first_bad.or(Some(error)),
             }
@@ -53,13 +52,13 @@ impl MeasuredFile {
         Ok(Self { path: path.to_owned(), parts, is_bdf: log.is_bdf(), reading: log.reading().clone() })
     }
 
-    /// Number of rows of all parts.
+    /// Returns the number of rows of all parts.
     pub fn rows(&self) -> usize {
         self.parts.iter().map(MeasuredPart::len).sum()
     }
 }
 
-/// Adds the last row of `log` to the last part, or to a new part if the section of the row differs.
+/// Adds the last row of `log` to the last part, or to a new part if the part column has changed.
 fn add_row(time_s: f64, log: &CsvLog, parts: &mut Vec<MeasuredPart>) {
     let [mut current_a, mut voltage_v, mut temperature_c] = [f64::NAN; 3];
     for (channel, value) in &log.values {

@@ -1,25 +1,25 @@
-//! Draws a cell model: open-circuit curve, slope of the curve, resistances over SOC and over temperature, and the SOC
-//! error that follows from them.
+//! Draws a cell model: the open-circuit curve and its slope, the resistances over SOC and over temperature, and the SOC
+//! error.
 //!
 //! Bands are 95 % intervals ([`ModelBands`]). If a model does not state the error of its curve, the curve has no band,
-//! and the description of the picture says so. A line is dashed where nothing was measured: outside the measured range,
-//! and where the value is only a prior.
+//! and the description of the picture says so. A line is dashed outside the measured range and where its value is only
+//! a prior.
 
 use crate::cell::model_bands::CURVE_C;
 use crate::cell::{CellModel, ModelBands};
 use crate::chart::{Axis, Chart, Ink, Layer, Picture, Shape};
 use crate::config::cell_model::{KnownBy, SourcedModel};
 
-/// Number of steps of a line over SOC or temperature.
 const POINTS: u32 = 200;
-/// Range of the picture over temperature, degrees Celsius; the picture ends earlier if the tables do.
+/// Largest temperature range that is drawn, degrees Celsius. The axis ends earlier if the tables do.
 const SHOWN_C: (f64, f64) = (-20.0, 50.0);
-/// Cold temperature that is drawn in addition to the temperature of the curve, degrees Celsius.
+/// Temperature of the line for a cold cell, degrees Celsius.
 const COLD_C: f64 = 0.0;
-/// Below this SOC, percent, a slope or a resistance may leave the picture, because both rise steeply towards empty.
+/// Lowest SOC (percent) that sets the height of the y axis. Slope and resistance rise steeply below it and may leave
+/// the picture.
 const STEEP_PERCENT: f64 = 12.0;
 
-/// Returns all pictures, each with the name of its file.
+/// Returns all pictures with their file names.
 pub fn all(sourced: &SourcedModel) -> Vec<(String, Picture)> {
     let pictures = [
         ("model_curve", Some(curve(sourced))),
@@ -35,7 +35,7 @@ fn along(low: f64, high: f64) -> impl Iterator<Item = f64> + Clone {
     (0..=POINTS).map(move |k| low + (high - low) * f64::from(k) / f64::from(POINTS))
 }
 
-/// Creates an axis that starts at 0 and has room for the points above [`STEEP_PERCENT`].
+/// Creates a y axis from 0 to the highest point above [`STEEP_PERCENT`], with 10 % of headroom.
 fn from_0(label: &str, layers: &[Layer]) -> Axis {
     let highest = layers.iter().flat_map(|layer| match &layer.shape {
         Shape::Line(points) | Shape::Dashed(points) => points.clone(),
@@ -54,7 +54,7 @@ fn soc_axis() -> Axis {
     Axis::number("SOC, %").within(0.0, 100.0)
 }
 
-/// Draws a line that is dashed where nothing was measured. The solid and the dashed part share the point at which they
+/// Draws a line that is dashed where nothing was measured. The solid and the dashed part share the point where they
 /// meet.
 fn line(label: &str, ink: Ink, points: &[(f64, f64)], is_measured: impl Fn(f64) -> bool) -> Vec<Layer> {
     let part = |wanted: bool| -> Vec<(f64, f64)> {
@@ -117,8 +117,8 @@ fn slope(sourced: &SourcedModel) -> Picture {
     )
 }
 
-/// Draws the settled resistance over `x`, in milliohms, with its 95 % interval. `place` converts `x` to SOC and
-/// temperature.
+/// Draws the steady-state resistance (milliohm) over `x`, with its 95 % interval. `place` converts `x` to (SOC,
+/// temperature).
 fn resistance_layers(
     sourced: &SourcedModel,
     (label, ink): (&str, Ink),
@@ -151,7 +151,6 @@ fn resistance_over_soc(sourced: &SourcedModel) -> Picture {
     chart(title, "Settled resistance, milliohm, over SOC", soc_axis(), from_0("m\u{3a9}", &layers), layers)
 }
 
-/// Returns the first and last temperature of the tables; `None` = the tables have a single temperature.
 fn ends_c(model: &CellModel) -> Option<(f64, f64)> {
     match model.temperature_c[..] {
         [low, .., high] => Some((low, high)),

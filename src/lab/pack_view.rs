@@ -1,5 +1,5 @@
-//! Formats the differences between the cells of a pack as lines with a name and a value. The lines also show the usable
-//! charge and energy, and the charge and energy that the pack loses because of these differences.
+//! Formats the differences between the cells of a pack as lines with a name and a value: usable charge and energy, and
+//! the charge and energy lost because the cells differ.
 //!
 //! Cells count from 1. The number after "±" is the standard deviation. Ah and kWh refer to one string.
 
@@ -32,7 +32,7 @@ pub fn lines(imbalance: &Result<Imbalance, UnknownImbalance>, model: Option<&Cel
             pack.left_out.iter().filter(|it| it.1 == *reason).map(|it| number(it.0).to_string()).collect();
         match cells.len() {
             0 => None,
-            // Maximum number of omitted cells that are listed by number: more do not fit into a line.
+            // More than 12 cell numbers do not fit into a line.
             count if count > 12 => Some(("left out", format!("{words}: {count} cells"))),
             _ => Some(("left out", format!("{words}: cell {}", cells.join(", ")))),
         }
@@ -40,7 +40,7 @@ pub fn lines(imbalance: &Result<Imbalance, UnknownImbalance>, model: Option<&Cel
     lines.into_iter().map(|(name, value)| (name.to_owned(), value)).collect()
 }
 
-/// Returns the energy (kWh) if every cell of a string moves the share `part` of the mean cell's capacity.
+/// Returns the energy (kWh) if every cell of a string moves `part` (a fraction) of the mean cell's capacity.
 pub fn energy_kwh(pack: &Imbalance, part: ScalarGaussian, model: &CellModel) -> ScalarGaussian {
     let string_v = mean_ocv_v(model, pack.mean_ah.mean) * (pack.cells + pack.left_out.len()) as f64;
     let ScalarGaussian { mean, variance } = pack.ah(part);

@@ -1,8 +1,7 @@
 //! Writes the report: one self-contained HTML file from the history of a store or from a replay.
 //!
 //! [`Data`] is collected from the store or the replay. [`page`] renders the page, and [`write_plots`] writes the
-//! pictures as separate files. Nothing here reads a clock, so the same data give the same bytes. An unknown value is
-//! shown as unknown, with the reason.
+//! pictures as separate files. An unknown value is shown as unknown, with the reason.
 
 mod bins;
 mod context;

@@ -1,13 +1,13 @@
-//! Forecasts the remaining useful life from measured capacity histories: a forecast at the end of a history, and
-//! forecasts at earlier points of the life, which are scored against the truth.
+//! Forecasts the remaining useful life from measured capacity histories, at the end of a history or at earlier points.
+//! Earlier forecasts are scored against the truth.
 //!
-//! Forecasts are made by the filter of the monitor ([`crate::health::forecast`]). The filter receives one reading after
-//! the other, and no reading that is later than the time of the forecast.
+//! Forecasts are made by the filter of the monitor ([`crate::health::forecast`]), which receives only the readings up
+//! to the time of the forecast.
 //!
-//! Terms: *use* is the number of discharges since the first reading, or the number of days if the file lists no
-//! discharges. The capacities are fitted by the non-increasing curve with the least squared error (isotonic fit). The
-//! *end of life* is the use at which this curve falls below the threshold, interpolated between the readings before and
-//! after. A temporary recovery after a rest therefore hardly moves the end of life.
+//! *Use* is the number of discharges since the first reading, or the number of days if the file lists no discharges.
+//! The capacities are fitted by the non-increasing curve with the least squared error (isotonic fit). The *end of life*
+//! is the use at which this curve falls below the threshold, interpolated between readings. A temporary recovery after
+//! a rest therefore hardly moves the end of life.
 
 mod baseline;
 mod document;
@@ -24,8 +24,8 @@ pub use document::{now_json, scored_json};
 pub use history::{History, MeasuredCapacity};
 pub use truth::end_of_life;
 
-/// Upper limit of an error, as a share of the life. Without this limit, a baseline that never reaches the end of life
-/// would dominate the mean.
+/// Upper limit of an error, as a share of the life. Otherwise, a baseline that never reaches the end of life would
+/// dominate the mean.
 pub const WORST_ERROR: f64 = 1.0;
 
 /// The capacity at which a life ends.
@@ -42,27 +42,26 @@ pub enum Threshold {
 pub struct ForecastScore {
     /// Share of the life that has passed at the time of the forecast.
     pub at: f64,
-    /// Number of readings up to this time.
+    /// Number of readings up to the forecast.
     pub readings: usize,
     /// True remaining life, units of use.
     pub truth: f64,
     /// Forecast quantiles 5, 50 and 95 %, units of use; `None` = no forecast.
     pub forecast: Option<[f64; 3]>,
-    /// Why there is no forecast.
+    /// Reason for a missing forecast.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub refused: Option<String>,
     /// Whether the relative error of the median is at most alpha.
     pub within_alpha: bool,
     /// Whether the interval contains the truth.
     pub covered: bool,
-    /// |median - truth| as a share of the life, at most [`WORST_ERROR`]. A rejected forecast has this maximum.
+    /// |median - truth| as a share of the life, at most [`WORST_ERROR`]. A missing forecast has this maximum.
     pub error: f64,
-    /// Remaining life from a straight line through the last points; `None` = the line never reaches the threshold.
+    /// Remaining life from a straight line through the last points; `None` = it never reaches the threshold.
     pub straight: Option<f64>,
     /// Error of the straight line, computed like `error`.
     pub straight_error: f64,
-    /// Remaining life from a double exponential fitted by least squares; `None` = the curve never reaches the
-    /// threshold.
+    /// Remaining life from a double exponential fitted by least squares; `None` = it never reaches the threshold.
     pub double_exponential: Option<f64>,
     /// Error of the double exponential, computed like `error`.
     pub double_exponential_error: f64,
@@ -77,8 +76,7 @@ pub struct HistoryScore {
     pub axis: Axis,
     /// Capacity at which the life ends (Ah).
     pub threshold_ah: f64,
-    /// Use at the end of life; `None` = the end of life is not reached, or was passed before the first reading, so
-    /// nothing is scored.
+    /// Use at the end of life. `None` = it is not reached or was passed before the first reading, so nothing is scored.
     pub end_of_life: Option<f64>,
     /// Smallest capacity of the file (Ah).
     pub least_capacity_ah: f64,
@@ -91,11 +89,11 @@ pub struct HistoryScore {
 pub struct ScoreTotal {
     /// Number of requested forecasts.
     pub forecasts: usize,
-    /// Number of rejected forecasts.
+    /// Number of missing forecasts.
     pub refused: usize,
-    /// Share of forecasts whose interval contains the truth. A rejected forecast counts as a miss.
+    /// Share of forecasts whose interval contains the truth. A missing forecast counts as a miss.
     pub coverage: f64,
-    /// Share of forecasts whose median has a relative error of at most alpha. A rejected forecast counts as a miss.
+    /// Share of forecasts whose median has a relative error of at most alpha. A missing forecast counts as a miss.
     pub within_alpha: f64,
     /// Mean error, as a share of the life.
     pub mean_error: f64,
@@ -174,7 +172,7 @@ pub fn now(history: &History, name: &str, threshold: Threshold) -> CurrentForeca
     }
 }
 
-/// Makes forecasts after these shares of the life and scores them. `progress` is called before each forecast; it may
+/// Makes forecasts after these shares of the life and scores them. `progress` is called before each forecast and may
 /// unwind to abort.
 pub fn score(
     history: &History,
@@ -217,7 +215,6 @@ pub fn total(scored: &[HistoryScore]) -> Option<ScoreTotal> {
     })
 }
 
-/// Scores one forecast, made after the share `at` of the life.
 fn judge(history: &History, threshold_ah: f64, end: f64, at: f64, alpha: f64) -> ForecastScore {
     let moment = at * end;
     let truth = end - moment;
@@ -228,7 +225,7 @@ fn judge(history: &History, threshold_ah: f64, end: f64, at: f64, alpha: f64) ->
         Ok(forecast) => (forecast, None),
         Err(why) => (None, Some(why.to_string())),
     };
-    // Remaining use, counted from the time of the forecast; 0 if the baseline is already below the threshold.
+    // Remaining use from the time of the forecast; 0 if the baseline is already below the threshold.
     let ahead = |crossing: Option<f64>| crossing.map(|used| (used - moment).max(0.0));
     let straight = ahead(baseline::straight(&known, threshold_ah));
     let double_exponential = ahead(baseline::double_exponential(&known, threshold_ah));
@@ -256,14 +253,13 @@ fn quantiles(axis: Axis, life: &RemainingLife) -> Option<[f64; 3]> {
     remaining.map(|remaining| [remaining.low, remaining.median, remaining.high])
 }
 
-/// Returns the filter after all readings until `moment`, units of use.
 fn forecast_until(history: &History, moment: f64) -> Forecast {
     let mut forecast = Forecast::new(history.axis, history.first_capacity_ah());
     let mut before = MeasuredCapacity::default();
     for row in &history.rows {
         let passed = row.since(&before);
         if row.used > moment {
-            // Adds the use until the time of the forecast, but not the capacity of the next reading.
+            // Add the use until the forecast, but not the capacity of the next reading.
             let part = (moment - before.used) / (row.used - before.used);
             let (cycles, days, rest_days) = (part * passed.cycles, part * passed.days, part * passed.rest_days);
             forecast.update(Usage { cycles, days, rest_days }, None);

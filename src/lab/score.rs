@@ -1,16 +1,15 @@
-//! Scores estimates against a known truth: measured files run through the real monitor, and its estimates are compared
+//! Scores estimates against a known truth. Measured files run through the real monitor, and its estimates are compared
 //! with the truth.
 //!
-//! Input: the files of cyclers ([`MeasuredFile`]), the configuration of a monitor, and the cases. A case states where
-//! in the file the estimator starts, and with which SOC and capacity. Each row of a file becomes the frame that would
-//! have carried it ([`feed`]), so every stage of the monitor takes part. Output, per file and case: the errors of the
-//! SOC in points (percent of a full cell), and the share of samples whose 95 % interval contains the truth. For whole
-//! lives, the same is computed for the usable capacity.
+//! Input: the files of cyclers ([`MeasuredFile`]), the configuration of a monitor, and the cases. A case states the
+//! row, the SOC and the capacity with which the estimator starts. Each row of a file becomes a CAN frame ([`feed`]), so
+//! that every stage of the monitor takes part. Output, per file and case: the errors of the SOC in points (percent of a
+//! full cell), and the share of samples whose 95 % interval contains the truth. For whole lives, the usable capacity is
+//! scored in the same way.
 //!
 //! The true SOC is 1 - `discharged_ah` / C, with the same C for all files. The true usable capacity comes from a table
-//! of published capacities. Every estimate counts once and is not weighted by time, so a part logged at 10 Hz counts
-//! more than a rest logged once a minute. Estimates without a truth and rows without an estimate are counted but not
-//! scored.
+//! of published capacities. Every estimate counts once, so a part logged at 10 Hz counts more than a rest logged once a
+//! minute. Estimates without a truth and rows without an estimate are counted but not scored.
 
 mod case;
 mod cycles;
@@ -48,36 +47,34 @@ pub struct ScoreSettings {
     pub monitor: MonitorConfig,
     /// Charge from full to empty that defines the true SOC (Ah).
     pub truth_capacity_ah: f64,
-    /// For a start in the middle of a file: the share of `truth_capacity_ah` that has been taken out before the start,
-    /// fraction.
+    /// For a start in the middle of a file: charge taken out before the start, as a fraction of `truth_capacity_ah`.
     pub remove: f64,
     /// Time after the start that is left out of the statistics (s).
     pub settle_s: f64,
-    /// Standard deviation of the initial SOC, fraction; `None` = derived from the initial error (see
-    /// [`ScoreSettings::initial_soc_std`]).
+    /// Standard deviation of the initial SOC, fraction; `None` = see [`ScoreSettings::initial_soc_std`].
     pub soc_std: Option<f64>,
     /// Standard deviation of the initial capacity, as a fraction of the model's capacity; `None` = as configured.
     pub capacity_std: Option<f64>,
-    /// Columns and sign of the files, if their headers do not say it.
+    /// Columns and current sign of the files, if their headers do not state them.
     pub table: CsvOptions,
-    /// If a gap between two rows is longer than this (s), the recorder counts as asleep.
+    /// A gap between two rows that is longer than this (s) means that the recorder was asleep.
     pub sleep_gap_s: f64,
     /// Capacity threshold (Ah); the first discharge below it is reported.
     pub threshold_ah: f64,
     /// Number of discharges at the start of a life that are left out of the statistics.
     pub skip_cycles: usize,
-    /// Smallest and largest size of a window, as a share of the charge that a half-cycle moves. The monitor sees only
-    /// the rows in the windows; `None` = the monitor sees all rows.
+    /// Smallest and largest size of a window, as a share of the charge of a half-cycle. The monitor receives only the
+    /// rows in the windows; `None` = it receives all rows.
     pub window: Option<(f64, f64)>,
-    /// State in which the monitor starts each file, learned from [`ScoreRequest::learn`]; `None` = the monitor starts
-    /// without learned values.
+    /// Learned state with which the monitor starts each file (see [`ScoreRequest::learn`]); `None` = it starts without
+    /// learned values.
     pub learned: Option<Learned>,
     /// Folder for the plots.
     pub plots: Option<PathBuf>,
 }
 
 impl ScoreSettings {
-    /// Returns the standard deviation of the initial SOC, fraction. Without a configured value, it is the size of the
+    /// Returns the standard deviation of the initial SOC, fraction. If it is not configured, it is the size of the
     /// initial error, but at least 5 points.
     pub fn initial_soc_std(&self, error_points: f64) -> f64 {
         self.soc_std.unwrap_or((error_points.abs() / 100.0).max(0.05))
@@ -95,12 +92,12 @@ pub struct ScoreJob {
     pub name: String,
 }
 
-/// Scores every file in every case; several files run in parallel. The results are in the order of `jobs`, and within a
-/// file in the order of `cases`. `progress` receives the index of the file, and the fraction of its work that was
-/// completed since the last call.
+/// Scores every file in every case; several files run in parallel. The results are in the order of `jobs` and, for each
+/// file, in the order of `cases`. `progress` receives the index of the file, and the fraction of its work completed
+/// since the last call.
 ///
 /// # Errors
-/// The error of the first file (in order) that cannot be scored.
+/// Returns the error of the first file (in order) that cannot be scored.
 pub fn run(
     jobs: &[ScoreJob],
     cases: &[Case],

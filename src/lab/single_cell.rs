@@ -1,24 +1,23 @@
-//! Creates the configuration of one measured cell, from a given configuration file or from the built-in one. The cell
-//! model can be replaced by another file or, in the built-in configuration, by a label.
+//! Creates the configuration of a single measured cell, from a given file or from the built-in configuration.
 //!
-//! Input: paths, or the data of a label. Output: a checked configuration. The built-in configuration has the input
-//! signals of `measured.dbc` and the default estimator keys. A fault names its file.
+//! Another model file can replace the cell model. In the built-in configuration, a label (chemistry, rated capacity,
+//! voltage limits) can also replace the cell model. The built-in configuration has the input signals of `measured.dbc`
+//! and the default estimator keys.
 
 use std::path::{Path, PathBuf};
 
 use crate::config::{self, Config, ConfigFaults, ConfigFiles};
 use packwatch_host::bounded_file;
 
-/// The built-in configuration and the files that it names.
 const BUILT_IN: [(&str, &[u8]); 2] =
     [("score.toml", include_bytes!("score.toml")), ("measured.dbc", include_bytes!("measured.dbc"))];
 
-/// The label of a cell without a model, as in the keys of `[pack]`.
+/// Data on the label of a cell, as in the keys of `[pack]`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LabelKeys {
     /// Name of the chemistry.
     pub chemistry: String,
-    /// Rated capacity (Ah). Without it, the configuration is faulty.
+    /// Rated capacity (Ah). Loading fails without it.
     pub rated_ah: Option<f64>,
     /// Lowest voltage (V); `None` = typical for the chemistry.
     pub voltage_min_v: Option<f64>,
@@ -30,11 +29,11 @@ pub struct LabelKeys {
 /// the cell model that the configuration names.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct CellSource {
-    /// Configuration; `None` = the built-in one.
+    /// Configuration file; `None` = the built-in configuration.
     pub config: Option<PathBuf>,
     /// Cell model file.
     pub cell: Option<PathBuf>,
-    /// Label, which replaces the cell model of the built-in configuration.
+    /// Label that replaces the cell model of the built-in configuration.
     pub label: Option<LabelKeys>,
 }
 
@@ -50,7 +49,7 @@ impl CellSource {
         let built_in = self.config.is_none();
         let path = self.config.clone().unwrap_or_else(|| PathBuf::from(BUILT_IN[0].0));
         let Some(cell) = &self.cell else { return config::load(&path) };
-        // Faults of the model are reported with its own file name.
+        // The model is first loaded alone, so that its errors are reported with its own file name.
         config::cell_model::load(cell)?;
         let read = |file: &Path| {
             let known = BUILT_IN.iter().find(|(name, _)| built_in && Path::new(name) == file);
@@ -83,7 +82,6 @@ impl LabelKeys {
         config::load_with(&ConfigFiles::alone(Path::new(BUILT_IN[0].0)), &read)
     }
 
-    /// Writes the keys of `[pack]`.
     fn text(&self) -> String {
         let mut text = format!("chemistry = {}\n", toml::Value::from(self.chemistry.as_str()));
         let numbers = [
@@ -98,14 +96,13 @@ impl LabelKeys {
     }
 }
 
-/// Returns the path of the cell model that a configuration names.
 fn named_cell(files: &ConfigFiles, read: config::ReadFile<'_>) -> Result<PathBuf, ConfigFaults> {
     let text = config::merged_with(files, read)?;
     let named = text.parse::<toml::Table>().ok().and_then(|table| {
         let model = table.get("pack")?.get("cell_model")?.as_str()?.to_owned();
         Some(files.main.parent().unwrap_or(Path::new("")).join(model))
     });
-    // If the configuration names no cell model, no file is replaced. Loading then reports the missing model, unless the
+    // If no model is named, the empty path has no effect. Loading then reports the missing model, unless the
     // configuration has a chemistry.
     Ok(named.unwrap_or_default())
 }

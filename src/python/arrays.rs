@@ -2,8 +2,8 @@
 //! copied if it is contiguous, aligned and of the right type.
 //!
 //! Masked and missing reals become NaN. Whole numbers are never rounded and never wrap around. A whole number that is
-//! missing, has a fraction or is out of range gives an error with its index. An array that does not contain
-//! numbers gives an error with its dtype.
+//! missing, has a fraction or is out of range gives an error with its index. An array that does not contain numbers
+//! gives an error with its dtype.
 
 use arrow_array::cast::AsArray;
 use arrow_array::types::{ArrowPrimitiveType, Float64Type, UInt8Type, UInt32Type};
@@ -19,17 +19,13 @@ use crate::error::data;
 pub(crate) struct Matrix<T: ArrowPrimitiveType> {
     /// The values. The memory may belong to Python and is kept until this buffer is dropped.
     pub(crate) values: ScalarBuffer<T::Native>,
-    /// Number of rows.
     pub(crate) rows: usize,
-    /// Number of values in a row.
     pub(crate) columns: usize,
     /// Whether the array has two dimensions.
     has_columns: bool,
 }
 
-/// A matrix of real numbers.
 pub(crate) type Reals = Matrix<Float64Type>;
-/// A matrix of whole numbers.
 pub(crate) type Words = Matrix<UInt32Type>;
 /// A matrix of bytes.
 pub(crate) type Bytes = Matrix<UInt8Type>;

@@ -39,7 +39,6 @@ impl BackgroundTask {
 /// The progress bar to show.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Progress<'a> {
-    /// Whether to show a bar.
     pub(crate) is_shown: bool,
     /// Total amount of work; `None` = unknown.
     pub(crate) total: Option<u64>,
@@ -93,7 +92,6 @@ fn look(py: Python<'_>, bar: Option<&Bar>, state: &BackgroundTask) -> PyResult<(
     bar.map_or(Ok(()), |bar| bar.show(py, state))
 }
 
-/// A tqdm bar.
 struct Bar {
     bar: Py<PyAny>,
     shown: AtomicU64,

@@ -18,7 +18,7 @@ pub(crate) fn data(error: impl Display) -> PyErr {
     DataError::new_err(printable(&with_arguments(&error.to_string())))
 }
 
-/// Options of the command line whose Python argument has another name. The names of all others differ only in `-`.
+/// Options of the command line whose Python argument has another name. For all other options, only `-` becomes `_`.
 const ARGUMENTS: [(&str, &str); 8] = [
     ("--capacity", "capacity_ah"),
     ("--column", "columns"),
@@ -44,8 +44,8 @@ fn with_arguments(text: &str) -> String {
     text.split(' ').map(argument).collect::<Vec<_>>().join(" ")
 }
 
-/// An error of reading or writing a file. Its class and its `errno` follow from the number of the operating system's
-/// error, with which the text ends.
+/// An error of reading or writing a file. The text ends with the error number of the operating system, which determines
+/// the exception's class and its `errno`.
 pub(crate) fn file(error: impl Display) -> PyErr {
     let text = printable(&error.to_string());
     Python::attach(|py| {
@@ -54,7 +54,6 @@ pub(crate) fn file(error: impl Display) -> PyErr {
     })
 }
 
-/// The faults of a configuration.
 pub(crate) fn config(faults: ConfigFaults) -> PyErr {
     let faults: Vec<String> = faults.0.iter().map(|fault| printable(fault)).collect();
     ConfigError::new_err((faults.join("\n"), faults))

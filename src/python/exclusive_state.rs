@@ -21,7 +21,6 @@ pub(crate) struct ExclusiveState<S> {
     holder: Mutex<Option<ThreadId>>,
 }
 
-/// Exclusive access of one call.
 pub(crate) struct StateGuard<'a, S> {
     state: MutexGuard<'a, S>,
     owner: &'a ExclusiveState<S>,

@@ -25,7 +25,6 @@ use crate::exclusive_state::ExclusiveState;
 use crate::outputs::{Columns, Outputs, Wanted};
 use crate::replay::check_sleep_gap;
 
-/// Number of rows between two progress reports.
 const REPORT_EVERY: usize = 16_384;
 /// Bit 31 of an identifier marks an extended identifier, as in a DBC and in SocketCAN.
 const EXTENDED: u32 = 0x8000_0000;
@@ -40,7 +39,6 @@ pub(crate) struct Monitor {
     limits: PlausibleRanges,
 }
 
-/// State after the inputs processed so far.
 struct State {
     driver: MonitorDriver,
     columns: Columns,
@@ -309,7 +307,7 @@ fn report(row: usize, work: &BackgroundTask) {
     }
 }
 
-/// Largest time (s) that is not taken for another unit. In seconds, it is the year 2262, where nanoseconds end.
+/// Largest time (s) that does not count as another unit. It is in the year 2261, near the largest time in nanoseconds.
 const MAX_TIME_S: f64 = 9.2e9;
 
 /// Converts times to seconds. `datetime64` becomes Unix time.
@@ -372,7 +370,7 @@ impl PlausibleRanges {
         Self { current_a: range(&sample.current), voltage_v, temperature_c: range(&sample.temperature), capacity_ah }
     }
 
-    /// Checks that the current moves a possible charge, if the times are seconds.
+    /// Checks that the current moves a possible charge if the times are in seconds.
     fn check_time(&self, time_s: &Reals, input: &RowInput) -> PyResult<()> {
         const MOST_ROWS: usize = 50_000;
         let rows = time_s.rows.min(MOST_ROWS);

@@ -67,13 +67,11 @@ impl Wanted {
 }
 
 impl Columns {
-    /// Adds outputs and clears them.
     pub(crate) fn take(&mut self, wanted: Wanted, out: &mut CoreOutputs) {
         self.add(wanted, out);
         out.clear();
     }
 
-    /// Adds outputs.
     pub(crate) fn add(&mut self, wanted: Wanted, out: &CoreOutputs) {
         if let Some(period_ns) = wanted.period_ns {
             out.estimates.iter().for_each(|estimate| self.estimates.add(period_ns, estimate));
@@ -146,8 +144,8 @@ impl EstimateColumns {
         self.reals.iter_mut().zip(values).for_each(|(column, value)| column.push(value));
     }
 
-    /// Whether this is the first estimate of its cell in its period. Periods are counted from the first estimate.
-    /// If the clock goes back, an earlier period begins again.
+    /// Whether this is the first estimate of its cell in its period. Periods are counted from the first estimate. If
+    /// the clock goes back, an earlier period begins again.
     fn begins_period(&mut self, period_ns: i64, estimate: &Estimate) -> bool {
         let first = *self.first.get_or_insert(estimate.time);
         let period = estimate.time.nanos().saturating_sub(first.nanos()).div_euclid(period_ns);
@@ -164,7 +162,6 @@ impl EstimateColumns {
         begins
     }
 
-    /// Whether an estimate at `time` may become a row.
     fn wants(&self, period_ns: i64, time: Timestamp, cells: usize) -> bool {
         let (Some(first), Some((latest, done))) = (self.first, self.latest) else { return true };
         done < cells || time.nanos().saturating_sub(first.nanos()).div_euclid(period_ns) != latest

@@ -42,7 +42,6 @@ impl Table {
         Py::new(py, self)
     }
 
-    /// Number of rows.
     pub(crate) fn rows(&self) -> usize {
         self.0.num_rows()
     }

@@ -1,12 +1,12 @@
 //! Defines the mean function and computes its generalised least-squares coefficients.
 //!
-//! Input: the matrix `G = [y H]' K^-1 [y H]`, with the targets `y`, the values `H` of the mean function's terms at
-//! every row, and the covariance `K` of the measurements. Output: the coefficients beta and their covariance. If the
+//! Input: the matrix `G = [y H]' K^-1 [y H]`, where `y` are the targets, `H` the values of the mean function's terms at
+//! every row, and `K` the covariance of the measurements. Output: the coefficients beta and their covariance. If the
 //! rows cannot separate the terms, the result is an error.
 //!
-//! Let W be a square root of `K^-1`. The coefficients are then the ordinary least-squares solution of `W y` on `W H`.
-//! `G` determines the coefficients, their covariance and the squared norm of the residual. The exact and the
-//! nearest-neighbour form of the process both compute `G`.
+//! The coefficients are the ordinary least-squares solution of `W y` on `W H`, where W is a square root of `K^-1`. `G`
+//! determines the coefficients, their covariance and the squared norm of the residual. Both the exact and the
+//! nearest-neighbour form of the process compute `G`.
 
 use serde::{Deserialize, Serialize};
 
@@ -26,7 +26,7 @@ pub enum Basis {
 }
 
 impl Basis {
-    /// Number of coefficients.
+    /// Returns the number of coefficients.
     pub fn size(self, dimensions: usize) -> usize {
         match self {
             Self::Zero => 0,
@@ -35,13 +35,12 @@ impl Basis {
         }
     }
 
-    /// Value of the mean function's k-th term at a (standardised) row.
+    /// Returns the value of the mean function's k-th term at a (standardised) row.
     pub(super) fn value(self, row: &[f64], k: usize) -> f64 {
         if k == 0 { 1.0 } else { row[k - 1] }
     }
 }
 
-/// Coefficients and their covariance.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Coefficients {
     pub beta: Vec<f64>,
@@ -58,7 +57,7 @@ impl Coefficients {
         let width = size + 1;
         let fault =
             || RegressionError::range("basis", format!("{size} functions"), "functions that the rows can separate");
-        // The Cholesky factor of the block `H' K^-1 H`, which is first scaled to ones on its diagonal.
+        // Compute the Cholesky factor of the block `H' K^-1 H`, scaled to ones on its diagonal.
         let scale: Vec<f64> = (1..width).map(|k| g[k * width + k].sqrt()).collect();
         if scale.iter().any(|s| !(*s > 0.0 && s.is_finite())) {
             return Err(fault());
@@ -85,8 +84,7 @@ impl Coefficients {
         Ok(Self { beta, covariance, squared_norm: squared_norm.max(0.0) })
     }
 
-    /// Completes the solution with the covariance matrix: `right` holds `L^-1 [y H]` and `factor` holds `L`, with `K =
-    /// L L'`. Returns `K^-1 (y - H beta)` and `K^-1 H`.
+    /// Returns `K^-1 (y - H beta)` and `K^-1 H`. `right` holds `L^-1 [y H]`, and `factor` holds `L` of `K = L L'`.
     pub(super) fn weights(&self, factor: &[f64], n: usize, mut right: Vec<f64>) -> (Vec<f64>, Vec<f64>) {
         solve_upper(factor, n, &mut right);
         let functions = right.split_off(n);
@@ -96,21 +94,18 @@ impl Coefficients {
         (right, functions)
     }
 
-    /// Returns the mean function's value at a row.
     pub(super) fn mean(&self, basis: Basis, row: &[f64]) -> f64 {
         (0..self.beta.len()).map(|k| self.beta[k] * basis.value(row, k)).sum()
     }
 
-    /// Contribution of the coefficients' uncertainty to the variance of a prediction. `rest` is `h(x) - H' K^-1 k(x)`,
-    /// where `h(x)` are the terms of the mean function at the row x, and `k(x)` are the covariances of x with the
-    /// training rows.
+    /// Returns the contribution of the coefficients' uncertainty to the variance of a prediction at the row x. `rest`
+    /// is `h - H' K^-1 k` with the mean function's terms `h` at x and the covariances `k` of x with the training rows.
     pub(super) fn variance(&self, rest: &[f64]) -> f64 {
         let size = self.beta.len();
         (0..size * size).map(|at| rest[at / size] * self.covariance[at] * rest[at % size]).sum::<f64>().max(0.0)
     }
 }
 
-/// Returns `(L L')^-1`, row-major.
 fn inverse_from_factor(l: &[f64], size: usize) -> Vec<f64> {
     let mut inverse = vec![0.0; size * size];
     for column in 0..size {

@@ -22,17 +22,15 @@ use super::scale::StandardisedRows;
 pub(super) const LEVEL: f64 = 0.95;
 /// Half width of a Gaussian interval with the coverage [`LEVEL`], in standard deviations.
 pub const GAUSSIAN: f64 = 1.959_963_984_540_054;
-/// Maximum number of rows that are left out, one at a time. With this number, the standard error of the factor is below
-/// 1 %.
+/// Maximum number of rows that are left out, one at a time. The standard error of the factor is then below 1 %.
 pub(super) const CALIBRATION_ROWS: usize = 8000;
-/// Weight of the overall mean when the spread at a row is computed. The overall mean counts like this number of rows.
+/// Weight of the overall mean in the spread at a row, as a number of rows.
 const SHRINKAGE: f64 = 20.0;
 
-/// The factor, and the data from which the spread is computed.
 #[derive(Debug, Clone)]
 pub(super) struct Calibration {
     pub factor: f64,
-    /// Numbers of the selected rows. `ratios` has one ratio for each of them.
+    /// Numbers of the selected rows. `ratios` has the same order.
     pub rows: Vec<u32>,
     pub ratios: Vec<f64>,
     near: usize,
@@ -41,19 +39,18 @@ pub(super) struct Calibration {
 }
 
 impl Calibration {
-    /// Returns the calibration of a Gaussian interval.
     pub(super) fn none() -> Self {
         Self { factor: GAUSSIAN, rows: vec![], ratios: vec![], near: 0, mean: 1.0, tree: None }
     }
 
     /// Calibrates with the selected rows and their leave-one-out ratios. Without rows, the interval is Gaussian.
     pub(super) fn new(data: &StandardisedRows, rows: Vec<u32>, ratios: Vec<f64>) -> Self {
-        // The spread at a row is computed from a twentieth of the selected rows, but from at most 200.
+        // The spread at a row is computed from a twentieth of the selected rows, at most 200.
         let near = (ratios.len() / 20).min(200);
         let mean = ratios.iter().sum::<f64>() / ratios.len() as f64;
         let inputs: Vec<f64> = rows.iter().flat_map(|row| data.row(*row as usize).to_vec()).collect();
         let tree =
-            // If the spread would be computed from fewer than 20 rows, it is 1 everywhere.
+            // With fewer than 20 rows, the spread is 1 everywhere.
             (near >= 20 && mean > 0.0).then(|| KdTree::new(&inputs, &inverse_deviations(&inputs, data)));
         let mut calibration = Self { factor: GAUSSIAN, rows, ratios, near, mean, tree };
         let d = data.dimensions;
@@ -61,15 +58,15 @@ impl Calibration {
         let mut relative: Vec<f64> = calibration.ratios.iter().enumerate().map(relative).collect();
         relative.sort_by(f64::total_cmp);
         let rank = ((relative.len() + 1) as f64 * LEVEL).ceil() as usize;
-        // If there are too few rows, the factor stays Gaussian.
+        // With too few rows, the factor stays Gaussian.
         if rank > 0 && rank <= relative.len() {
             calibration.factor = relative[rank - 1];
         }
         calibration
     }
 
-    /// Width of the residuals at a standardised row, relative to the mean width over all selected rows. `excluded` is
-    /// the index of a selected row that is not used.
+    /// Returns the width of the residuals at a standardised row, relative to the mean over all selected rows.
+    /// `excluded` is the index of a selected row that is ignored.
     fn spread(&self, row: &[f64], excluded: Option<usize>) -> f64 {
         let Some(tree) = &self.tree else { return 1.0 };
         let near = tree.nearest(row, self.near, self.ratios.len(), excluded);
@@ -77,7 +74,7 @@ impl Calibration {
         (sum + SHRINKAGE * self.mean) / (near.len() as f64 + SHRINKAGE) / self.mean
     }
 
-    /// Half width of the interval at a standardised row, in standard deviations of a measurement.
+    /// Returns the half width of the interval at a standardised row, in standard deviations of a measurement.
     pub(super) fn half_width(&self, row: &[f64]) -> f64 {
         self.factor * self.spread(row, None)
     }
@@ -115,13 +112,13 @@ mod tests {
 
     #[test]
     fn intervals_are_wider_where_residuals_are_wider() {
-        // Ratios between 0 and 1 in the first half, between 0 and 3 in the second.
+        // Ratios are between 0 and 1 in the first half, and between 0 and 3 in the second.
         let ratio = |k: u32| f64::from(k * 7919 % 1000) / 1000.0 * if k < 2000 { 1.0 } else { 3.0 };
         let calibration = Calibration::new(&data(4000), (0..4000).collect(), (0..4000).map(ratio).collect());
         let (narrow, wide) = (calibration.half_width(&[800.0]), calibration.half_width(&[3100.0]));
         assert!((0.90..1.1).contains(&narrow) && (2.6..2.95).contains(&wide), "{narrow}, {wide}");
         let held = |from: u32, half: f64| (from..from + 2000).filter(|k| ratio(*k) <= half).count();
-        // Shrinkage makes the interval slightly too wide in the first half and too narrow in the second. Together, the
+        // Shrinkage makes the interval slightly too wide in the first half and too narrow in the second. Together, both
         // intervals contain 95 %.
         let (first, second) = (held(0, narrow), held(2000, wide));
         assert!(second >= 1760 && (3740..=3860).contains(&(first + second)), "{first}, {second}");

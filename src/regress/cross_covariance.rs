@@ -5,16 +5,14 @@
 
 use super::plan::{Covariance, Work};
 
-/// Number of pairs per block. The memory of one block fits the first-level cache.
+/// Number of pairs per block. The memory of a block fits into the first-level cache.
 pub(super) const BLOCK_PAIRS: usize = 1024;
 
-/// Converts row-major inputs to column-major order.
 pub(super) fn by_column(inputs: &[f64], dimensions: usize) -> Vec<f64> {
     (0..dimensions).flat_map(|d| inputs.iter().skip(d).step_by(dimensions).copied()).collect()
 }
 
 impl Covariance {
-    /// Writes the covariance of one point with the rows `first..` of `columns` to `out`.
     pub(super) fn cross(
         &self,
         columns: &[f64],
@@ -31,8 +29,8 @@ impl Covariance {
     }
 }
 
-/// Writes the squared differences between the rows `from..from + count` and a point to `out`: first the differences of
-/// the first input, then the differences of the second input, and so on.
+/// Writes the squared differences between the rows `from..from + count` and a point to `out`: first those of the first
+/// input, then those of the second input, and so on.
 pub(super) fn squares(columns: &[f64], from: usize, count: usize, point: &[f64], out: &mut Vec<f64>) {
     let n = columns.len() / point.len();
     out.resize(count * point.len(), 0.0);

@@ -10,7 +10,7 @@ pub enum RegressionError {
         text: String,
         /// Column of the error, from 1.
         column: usize,
-        /// Text found there.
+        /// Text found in this column.
         found: String,
         /// Allowed text.
         allowed: String,
@@ -18,7 +18,7 @@ pub enum RegressionError {
     /// A number in the rows is not finite.
     #[error("line {line}: {what} = {found}, must be a finite number")]
     NotFinite {
-        /// Line of the row in its file or, if the row is not from a file, the number of the row from 1.
+        /// Line of the row in its file. If the row is not from a file, the number of the row from 1.
         line: u64,
         /// `input 2` or `target`.
         what: String,
@@ -30,7 +30,7 @@ pub enum RegressionError {
     OutOfRange {
         /// Name of the quantity.
         what: String,
-        /// Its value.
+        /// Value of the quantity.
         found: String,
         /// Allowed range.
         allowed: String,

@@ -1,5 +1,4 @@
-//! Implements the exact Gaussian process, which uses all pairs of the n rows. It needs time proportional to n^3 and
-//! memory proportional to n^2.
+//! Implements the exact Gaussian process, which uses all pairs of the n rows. Time grows with n^3 and memory with n^2.
 //!
 //! Input: standardised rows and hyperparameters. Output: likelihood, gradient and predictions. If the covariance matrix
 //! is not positive definite even with the largest jitter, the result is an error.
@@ -23,10 +22,8 @@ use super::linear_algebra::{add, cholesky, dot, log_determinant, parallelism, so
 use super::plan::{Covariance, Plan, Work};
 use super::scale::StandardisedRows;
 
-/// Maximum number of rows that are predicted or left out in one block.
 const BLOCK_QUERIES: usize = 256;
 
-/// State for predictions.
 #[derive(Debug, Clone)]
 pub(super) struct Posterior {
     pub data: StandardisedRows,
@@ -34,7 +31,6 @@ pub(super) struct Posterior {
     pub coefficients: Coefficients,
     /// Inputs of the training rows, column-major.
     columns: Vec<f64>,
-    /// Lower Cholesky factor, column-major.
     factor: Vec<f64>,
     /// `K^-1 (y - H beta)`.
     alpha: Vec<f64>,
@@ -73,7 +69,7 @@ impl Posterior {
         Ok(Self { data, covariance, coefficients, columns, factor, alpha, basis_solved, value, jitter, used_jitter })
     }
 
-    /// Derivatives of the negative log likelihood with respect to every parameter.
+    /// Returns the derivatives of the negative log likelihood with respect to every parameter.
     pub(super) fn gradient(&self) -> Vec<f64> {
         let n = self.data.len();
         let par = parallelism();
@@ -113,7 +109,6 @@ impl Posterior {
         gradient
     }
 
-    /// Mean and variance of the function at standardised rows.
     pub(super) fn predict(&self, queries: &[f64]) -> Vec<(f64, f64)> {
         let (n, d) = (self.data.len(), self.data.dimensions);
         let mut all = Vec::with_capacity(queries.len() / d);
@@ -135,8 +130,7 @@ impl Posterior {
         all
     }
 
-    /// Returns the mean at a row, and the `rest` for [`Coefficients::variance`]: the terms of the mean function at the
-    /// row minus the part that the training rows predict.
+    /// Returns the mean at a row, and `rest` of [`Coefficients::variance`].
     fn mean(&self, row: &[f64], cross: &[f64]) -> (f64, Vec<f64>) {
         let n = self.data.len();
         let rest = |k: usize| self.data.basis.value(row, k) - dot(&self.basis_solved[k * n..][..n], cross);
@@ -144,8 +138,8 @@ impl Posterior {
         (self.coefficients.mean(self.data.basis, row) + dot(&self.alpha, cross), rest)
     }
 
-    /// Returns the residual and the measurement variance of each given row when this row is left out. The coefficients
-    /// of the mean function are not fitted again.
+    /// Returns the residual and the measurement variance of each given row when it is left out. The coefficients of the
+    /// mean function are not fitted again.
     pub(super) fn left_out(&self, rows: &[u32]) -> Vec<(f64, f64)> {
         let n = self.data.len();
         let mut all = Vec::with_capacity(rows.len());
@@ -162,11 +156,9 @@ impl Posterior {
     }
 }
 
-/// Fills the lower triangle with the covariance of all measurements.
 fn fill(covariance: &Covariance, data: &StandardisedRows, columns: &[f64], jitter: f64, matrix: &mut [f64]) {
     let n = data.len();
     let diagonal = covariance.prior_variance * (1.0 + jitter) + covariance.noise_variance;
-    // Each task fills at most 8 columns.
     matrix.par_chunks_mut(n).enumerate().with_max_len(8).for_each_init(Default::default, |scratch, (j, column)| {
         column[j] = diagonal;
         covariance.cross(columns, j + 1, data.row(j), scratch, &mut column[j + 1..]);

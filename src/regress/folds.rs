@@ -1,7 +1,7 @@
 //! Performs a k-fold cross-validation: every row is predicted by a model that was fitted without this row.
 //!
-//! Input: rows, settings and the number of folds. Output: a prediction of every row, and the errors of the predictions
-//! in units of the target. The cross-validation fails if the number of folds is out of range or if a fit fails.
+//! The errors are in units of the target. The cross-validation fails if the number of folds is out of range or if a fit
+//! fails.
 
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
@@ -19,7 +19,7 @@ use super::settings::{FitProgress, GprSettings, ProgressCallback, TrainingRows};
 pub struct Fold {
     /// Number of held-out rows.
     pub held_out: usize,
-    /// Duration of the fit, measured with the caller's clock (s).
+    /// Duration of the fit (s), measured with the caller's clock.
     pub fit_s: f64,
     /// Duration of the predictions (s).
     pub predict_s: f64,
@@ -36,8 +36,7 @@ pub struct Fold {
 /// Result of a cross-validation.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Folds {
-    /// Prediction of every row, in the order of the rows. Each row is predicted by the model of the fold that held it
-    /// out.
+    /// Prediction of every row, in the order of the rows, by the model of the fold that held out the row.
     pub predictions: Vec<Prediction>,
     /// Number of the fold that held out each row, from 0.
     pub fold_of_row: Vec<usize>,
@@ -54,10 +53,10 @@ pub struct PredictionScore {
     pub mean_absolute_error: f64,
     /// Fraction of the rows inside the 95 % interval.
     pub coverage_95: f64,
-    /// Fraction of the rows whose residual is at most 1.96 standard deviations of a measurement. This is the coverage
-    /// of an interval that is not calibrated.
+    /// Fraction of the rows whose residual is at most 1.96 standard deviations of a measurement: the coverage without
+    /// calibration.
     pub gaussian_coverage_95: f64,
-    /// Mean width of the 95 % interval, from its lower to its upper end.
+    /// Mean width of the 95 % interval, from lower to upper end.
     pub mean_width_95: f64,
 }
 
@@ -89,8 +88,7 @@ pub fn assign(rows: usize, folds: usize, seed: u64) -> Vec<usize> {
     fold_of_row
 }
 
-/// Cross-validates. `clock` returns the time in seconds since an arbitrary origin; it measures the durations of the
-/// folds.
+/// Cross-validates. `clock` returns the time in seconds since an arbitrary origin, for the durations of the folds.
 pub fn cross_validate(
     rows: &TrainingRows,
     settings: &GprSettings,

@@ -1,8 +1,7 @@
-//! Finds the necessary jitter: a small number that is added to the diagonal of a covariance matrix if the matrix alone
-//! has no Cholesky factor.
+//! Finds the jitter: a small number on the diagonal that a covariance matrix needs to have a Cholesky factor.
 //!
-//! Input: a function that tries to factorise with a given jitter. Output: the smallest of the tried
-//! jitters that is sufficient, as a fraction of the signal variance, or an error.
+//! Input: a function that tries to factorise with a given jitter. Output: the smallest sufficient jitter of those
+//! tried, as a fraction of the signal variance, or an error.
 
 use serde::{Deserialize, Serialize};
 
@@ -12,12 +11,11 @@ use super::error::RegressionError;
 const TRIES: [f64; 5] = [0.0, 1e-10, 1e-8, 1e-6, LAST];
 pub(super) const LAST: f64 = 1e-4;
 
-/// How much jitter a model needed, because some of its covariance matrices were not positive definite.
+/// Jitter that a model needed because covariance matrices were not positive definite.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Jitter {
-    /// Number of matrices that needed jitter when the final model's likelihood was computed. Jitter in predictions is
-    /// not counted.
+    /// Number of matrices that needed jitter in the final likelihood. Jitter in predictions is not counted.
     pub matrices: usize,
     /// Largest jitter that was needed, as a fraction of the signal variance.
     pub largest: f64,

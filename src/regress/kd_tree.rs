@@ -1,11 +1,10 @@
-//! Implements a k-d tree, which finds the rows that are nearest to a point. The search may be limited to rows with
-//! numbers below a given number.
+//! Implements a k-d tree, which finds the rows nearest to a point. The search may be limited to rows with numbers below
+//! a given number.
 //!
-//! Input: rows, a weight for each input, and a point. Output: row numbers, nearest first. The caller checks that all
-//! inputs are finite.
+//! The caller checks that all inputs are finite.
 //!
 //! The distance is Euclidean after each input is multiplied by its weight. Of two rows at the same distance, the row
-//! with the lower number counts as nearer, so the result does not depend on the layout of the tree.
+//! with the lower number is nearer, so that the result does not depend on the layout of the tree.
 
 use std::collections::BinaryHeap;
 
@@ -13,9 +12,8 @@ use std::collections::BinaryHeap;
 #[derive(Debug, Clone)]
 pub(super) struct KdTree {
     weights: Vec<f64>,
-    /// Inputs multiplied by their weights. The rows are in the order of the leaves.
+    /// Weighted inputs. The rows are in the order of the leaves.
     points: Vec<f64>,
-    /// Row numbers in the order of the leaves.
     numbers: Vec<u32>,
     nodes: Vec<TreeNode>,
 }
@@ -26,15 +24,15 @@ struct TreeNode {
     end: usize,
     /// Lowest row number in the subtree of this node.
     minimum: u32,
-    /// Axis, position of the cut, and index of the right child. The left child is the next node. `None` = this node is
-    /// a leaf.
+    /// Axis, position of the cut, and index of the right child. The left child is the next node. `None` = the node is a
+    /// leaf.
     cut: Option<(usize, f64, usize)>,
 }
 
-/// A heap of the nearest rows found. Its top is the farthest of these rows.
+/// The nearest rows found. The top of the heap is the farthest of them.
 struct NearestHeap {
-    /// Bit pattern of the squared distance, and the row number. Non-negative floats and their bit patterns have the
-    /// same order.
+    /// Bit pattern of the squared distance, and the row number. Bit patterns of non-negative floats sort like the
+    /// floats.
     heap: BinaryHeap<(u64, u32)>,
     wanted: usize,
 }
@@ -54,7 +52,6 @@ impl NearestHeap {
 }
 
 impl KdTree {
-    /// Builds a tree of rows that have `weights.len()` inputs each.
     pub(super) fn new(inputs: &[f64], weights: &[f64]) -> Self {
         let d = weights.len();
         let weighted: Vec<f64> = inputs.iter().enumerate().map(|(at, x)| x * weights[at % d]).collect();
@@ -79,7 +76,6 @@ impl KdTree {
             ends.1 - ends.0
         };
         let axis = (0..d).max_by(|a, b| spread(*a).total_cmp(&spread(*b))).unwrap_or(0);
-        // A leaf has at most 16 rows.
         if rows.len() <= 16 || spread(axis) <= 0.0 {
             return;
         }

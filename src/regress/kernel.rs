@@ -1,6 +1,6 @@
-//! Defines covariance functions (kernels), as text and as a tree. Kernels are sums and products of five shapes.
+//! Defines covariance functions (kernels) as text and as a tree. Kernels are sums and products of five shapes.
 //!
-//! Input: text. Output: a [`Kernel`], or an error with the column in the text. A kernel can be converted to text again.
+//! A kernel can be converted to text again. A parse error states the column in the text.
 //!
 //! In this table, r is the distance between two rows after each input is divided by its length scale:
 //!
@@ -13,8 +13,8 @@
 //! | `rational_quadratic` | (1 + r^2 / (2 alpha))^-alpha |
 //!
 //! Operators have their usual precedence, as in `a + b * (c + d)`. A name may contain dashes instead of underscores.
-//! Every shape has its own length scales. Every shape also has its own standard deviation, except in a product: there,
-//! only the first factor has one, because several could not be distinguished.
+//! Every shape has its own length scales and its own standard deviation. In a product, only the first factor has a
+//! standard deviation, because several standard deviations could not be distinguished.
 
 use std::fmt;
 use std::str::FromStr;
@@ -23,21 +23,21 @@ use serde::{Deserialize, Serialize};
 
 use super::error::RegressionError;
 
-/// Maximum nesting depth of brackets. The limit is necessary because the parser is recursive.
+/// Maximum nesting depth of brackets. It limits the recursion of the parser.
 const MAX_DEPTH: usize = 16;
 /// Maximum number of shapes in one kernel. Each shape has its own parameters.
 const MAX_SHAPES: usize = 16;
 
-/// One covariance function that depends on the distance only.
+/// A covariance function that depends only on the distance.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Shape {
-    /// Functions that are rough: an Ornstein-Uhlenbeck process.
+    /// Rough functions: an Ornstein-Uhlenbeck process.
     Exponential,
-    /// Functions that are once differentiable.
+    /// Functions that are differentiable once.
     Matern32,
-    /// Functions that are twice differentiable.
+    /// Functions that are differentiable twice.
     Matern52,
-    /// Functions that are infinitely often differentiable.
+    /// Functions that are differentiable infinitely often.
     SquaredExponential,
     /// A mixture of squared exponentials with different length scales.
     RationalQuadratic,
@@ -48,7 +48,7 @@ impl Shape {
     pub const ALL: [Self; 5] =
         [Self::Exponential, Self::SquaredExponential, Self::Matern32, Self::Matern52, Self::RationalQuadratic];
 
-    /// Name of the shape in the text of a kernel.
+    /// Returns the name of the shape in the text of a kernel.
     pub fn name(self) -> &'static str {
         match self {
             Self::Exponential => "exponential",
@@ -60,8 +60,8 @@ impl Shape {
     }
 }
 
-/// A covariance function: a tree of shapes, sums and products. `parse` creates it from text; `to_string` converts it to
-/// text.
+/// A covariance function: a tree of shapes, sums and products. `parse` creates it from text; `to_string` converts it
+/// back.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct Kernel {
@@ -195,8 +195,7 @@ impl KernelParser<'_> {
     }
 }
 
-/// Replaces each sum that is a term of a sum by its terms, and each product that is a factor of a product by its
-/// factors.
+/// Replaces nested sums by their terms and nested products by their factors.
 fn flat(nodes: Vec<Node>, is_sum: bool) -> Vec<Node> {
     let mut all = Vec::new();
     for node in nodes {

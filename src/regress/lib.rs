@@ -1,10 +1,10 @@
 //! Gaussian process regression on numbers. This crate is independent of batteries.
 //!
-//! The model of a target y at the inputs x is `y = h(x)' beta + f(x) + noise`. It has three parts: a mean function
-//! `h(x)' beta` (zero, a constant or a plane) with generalised least-squares coefficients beta, a Gaussian process `f`
-//! with a covariance function ([`Kernel`]), and white noise. The hyperparameters maximise the marginal likelihood. The
-//! search uses the exact gradient of the likelihood. Source: Rasmussen and Williams, *Gaussian Processes for Machine
-//! Learning*, 2006, chapters 2, 5 and 8.
+//! The model of a target y at the inputs x is `y = m(x) + f(x) + noise`. The mean function `m` is zero, a constant or a
+//! plane, with generalised least-squares coefficients. `f` is a Gaussian process with a covariance function
+//! ([`Kernel`]), and the noise is white. The hyperparameters maximise the marginal likelihood. The search uses the
+//! exact gradient of the likelihood. Source: Rasmussen and Williams, *Gaussian Processes for Machine Learning*, 2006,
+//! chapters 2, 5 and 8.
 //!
 //! Data flow:
 //!
@@ -32,8 +32,8 @@
 //! 3. The half width of the 95 % interval is not fixed at 1.96 standard deviations. It is calibrated for each predicted
 //!    row with leave-one-out predictions of training rows ([`GprSettings::calibrate`]).
 //!
-//! The same rows, settings and seed give the same results if they are computed on the same machine with the same number
-//! of threads. Otherwise, results of the linear algebra may differ in the last bits.
+//! The same rows, settings and seed give the same results on the same machine with the same number of threads.
+//! Otherwise, results of the linear algebra may differ in the last bits.
 
 mod basis;
 mod calibration;

@@ -1,5 +1,5 @@
 //! Provides dense linear algebra on column-major slices. The factorisation and the solvers use all threads of the
-//! thread pool in which they are called.
+//! current thread pool.
 //!
 //! [`cholesky`] reports a matrix that is not positive definite. If an input is NaN, the result is NaN.
 
@@ -8,7 +8,7 @@ use faer::linalg::cholesky::llt;
 use faer::linalg::triangular_solve::{solve_lower_triangular_in_place, solve_upper_triangular_in_place};
 use faer::{MatMut, MatRef, Par};
 
-/// Returns the number of threads of the present thread pool, in the form that faer needs.
+/// Returns the number of threads of the current thread pool, in the form that faer needs.
 pub(super) fn parallelism() -> Par {
     match rayon::current_num_threads() {
         0 | 1 => Par::Seq,
@@ -41,17 +41,14 @@ pub(super) fn solve_upper(l: &[f64], n: usize, right: &mut [f64]) {
     solve_upper_triangular_in_place(MatRef::from_column_major_slice(l, n, n).transpose(), right, parallelism());
 }
 
-/// Scalar product of two vectors.
 pub(super) fn dot(a: &[f64], b: &[f64]) -> f64 {
     a.iter().zip(b).map(|(x, y)| x * y).sum()
 }
 
-/// Adds the vector `part` to `total`.
 pub(super) fn add(total: &mut [f64], part: &[f64]) {
     total.iter_mut().zip(part).for_each(|(total, part)| *total += part);
 }
 
-/// Logarithm of the determinant of the matrix `L L'`, where `L` is the lower factor `l`.
 pub(super) fn log_determinant(l: &[f64], n: usize) -> f64 {
     (0..n).map(|k| l[k * n + k].ln()).sum::<f64>() * 2.0
 }

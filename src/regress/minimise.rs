@@ -1,15 +1,12 @@
 //! Minimises a smooth function of a few variables within bounds, by a quasi-Newton method (BFGS).
 //!
-//! Input: a start, bounds, and a function that returns its value and gradient. Output: the lowest point found.
-//!
-//! A variable that is at a bound stays fixed during a step if the descent would move it beyond the bound. Each step is
+//! If the descent would move a variable beyond its bound, the variable stays fixed during the step. Each step is
 //! projected onto the bounds and shortened until the function decreases enough (Armijo condition). A point at which the
 //! function has no value counts as infinitely high.
 
 /// Value and gradient of the objective; `None` = no value at this point.
 pub(super) type Evaluation = Option<(f64, Vec<f64>)>;
 
-/// The lowest point found.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Minimum {
     pub x: Vec<f64>,
@@ -18,7 +15,6 @@ pub(super) struct Minimum {
     pub iterations: usize,
 }
 
-/// Bounds and stopping rule of a search.
 #[derive(Debug, Clone)]
 pub(super) struct SearchLimits<'a> {
     pub low: &'a [f64],
@@ -79,20 +75,18 @@ fn line_search<E>(
     }
     // A step changes no variable by more than 2. Variables are logarithms, so this is a factor of about 7.
     let mut step = (2.0 / longest).min(1.0);
-    // At most 12 step lengths are tried.
     for _ in 0..12 {
         let x: Vec<f64> =
             (0..at.x.len()).map(|k| (at.x[k] + step * direction[k]).clamp(limits.low[k], limits.high[k])).collect();
         let slope: f64 = (0..x.len()).map(|k| at.gradient[k] * (x[k] - at.x[k])).sum();
         let found = objective(&x)?;
         if let Some((value, gradient)) = found.filter(is_finite) {
-            // A step is accepted if the value decreases by at least this fraction of the decrease that the gradient
-            // predicts.
+            // The value must decrease by at least this fraction of the decrease that the gradient predicts.
             if slope < 0.0 && value <= at.value + 1e-4 * slope {
                 return Ok(Some(Minimum { x, value, gradient, iterations: at.iterations + 1 }));
             }
-            // The next trial goes to the minimum of the parabola through both points, but the step becomes neither
-            // shorter than 10 % nor longer than 50 % of the present one.
+            // The next trial is the minimum of the parabola through both points, limited to 10 % to 50 % of the present
+            // step.
             let bend = 2.0 * (value - at.value - slope);
             step *= if bend > 0.0 { (-slope / bend).clamp(0.1, 0.5) } else { 0.5 };
         } else {
@@ -102,7 +96,6 @@ fn line_search<E>(
     Ok(None)
 }
 
-/// Approximate inverse Hessian.
 struct InverseHessian {
     matrix: Vec<f64>,
     size: usize,

@@ -1,7 +1,7 @@
 //! Fits a Gaussian process to rows, predicts further rows, and returns the hyperparameters.
 //!
-//! Input: rows and settings. Output: a [`Model`] that predicts in units of the target. Invalid rows and invalid
-//! settings give an error.
+//! Input: rows and settings. Output: a [`Model`] that predicts in units of the target. Invalid rows and settings give
+//! an error.
 
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
@@ -25,12 +25,10 @@ use super::{exact, nearest};
 
 /// Maximum number of rows that the search of [`Form::Nearest`] uses. More rows do not change predictions noticeably.
 const SEARCH_ROWS: usize = 6000;
-/// Maximum number of threads.
 const MAX_THREADS: usize = 1024;
-/// Maximum number of additional searches.
 const MAX_RESTARTS: usize = 1000;
 
-/// One hyperparameter. Length scales have the unit of the inputs, or no unit if the inputs are standardised. Standard
+/// A hyperparameter. Length scales have the unit of the inputs, or no unit if the inputs are standardised. Standard
 /// deviations have the unit of the target.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Hyperparameter {
@@ -43,14 +41,14 @@ pub struct Hyperparameter {
 /// Prediction at one row.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Prediction {
-    /// Mean of the function. It is also the mean of a measurement, because noise has mean zero.
+    /// Mean of the function and, because noise has mean zero, of a measurement.
     pub mean: f64,
     /// Variance of the function's value. More training rows reduce it.
     pub function_variance: f64,
-    /// Variance of a new measurement: the variance of the function plus the variance of the noise.
+    /// Variance of a new measurement: variance of the function plus variance of the noise.
     pub measurement_variance: f64,
-    /// Lower end of the interval that contains 95 % of new measurements (see [`Model::interval_factor`]). If residuals
-    /// are not Gaussian or if their width varies, the half width of the interval differs from 1.96 standard deviations.
+    /// Lower end of the interval that contains 95 % of new measurements (see [`Model::interval_factor`]). Its half
+    /// width differs from 1.96 standard deviations if residuals are not Gaussian or if their width varies.
     pub low_95: f64,
     /// Upper end of the interval that contains 95 % of new measurements.
     pub high_95: f64,
@@ -71,7 +69,7 @@ pub struct Model {
     pub(super) pool: ThreadPool,
 }
 
-/// The structure of a model, without fitted values.
+/// Structure of a model, without fitted values.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ModelSpec {
@@ -81,7 +79,7 @@ pub struct ModelSpec {
     pub basis: Basis,
     /// Whether every input has its own length scale.
     pub ard: bool,
-    /// Whether the covariance is exact or approximated with nearest neighbours.
+    /// Form of the covariance: exact, or approximated with nearest neighbours.
     pub form: Form,
     /// Number of inputs of a row.
     pub dimensions: usize,
@@ -95,7 +93,7 @@ pub struct FitOutcome {
     pub log_likelihood: f64,
     /// Jitter that the final model needed.
     pub jitter: Jitter,
-    /// Number of steps of the best search, summed over all its selections of neighbours.
+    /// Number of steps of the best search, over all its selections of neighbours.
     pub iterations: usize,
 }
 
@@ -148,7 +146,6 @@ pub fn fit(
     job.finish(theta, iterations)
 }
 
-/// A fit in progress: settings, standardised rows and plan.
 struct FitJob<'a> {
     settings: &'a GprSettings,
     scale: Scale,
@@ -198,7 +195,6 @@ impl<'a> FitJob<'a> {
         Ok(given.iter().zip(&self.plan.parameters).map(|(value, p)| (value / p.role.unit(&self.scale)).ln()).collect())
     }
 
-    /// Runs all searches. Returns the hyperparameters that the best search found, and its number of steps.
     fn search(&self, watcher: &mut ProgressCallback) -> Result<(Vec<f64>, usize), RegressionError> {
         let searches = self.settings.restarts + 1;
         let mut best: Option<Minimum> = None;
@@ -228,8 +224,8 @@ impl<'a> FitJob<'a> {
         best.map(|best| (best.x, best.iterations)).ok_or(RegressionError::NotPositiveDefinite { jitter: jitter::LAST })
     }
 
-    /// Runs one search. For [`Form::Nearest`], the search is repeated with newly selected neighbours until the length
-    /// scales no longer change the order of distances.
+    /// Runs one search. For [`Form::Nearest`], neighbours are selected again and the search is repeated until the
+    /// length scales do not change the order of distances.
     fn one_search(&self, mut start: Vec<f64>, monitor: &mut SearchMonitor) -> Result<Option<Minimum>, RegressionError> {
         let (low, high) = log_bounds(&self.plan, self.spread);
         let mut found: Option<Minimum> = None;
@@ -315,14 +311,14 @@ impl<'a> FitJob<'a> {
     }
 }
 
-/// Returns at most `most` row numbers, evenly spaced in `0..n`. This is a random sample for [`Form::Nearest`], whose
-/// rows are in random order.
+/// Returns at most `most` row numbers, evenly spaced in `0..n`. For [`Form::Nearest`], they are a random sample,
+/// because its rows are in random order.
 fn evenly_spaced(n: usize, most: usize) -> Vec<u32> {
     let count = n.min(most);
     (0..count).map(|k| u32::try_from(k * n / count).unwrap_or(u32::MAX)).collect()
 }
 
-/// Whether the weights of two metrics are nearly proportional, so that the metrics order rows in the same way.
+/// Whether the weights of two metrics are nearly proportional, so that both order rows in the same way.
 fn is_same_metric(a: &[f64], b: &[f64]) -> bool {
     let ratios = || a.iter().zip(b).map(|(a, b)| (a / b).ln());
     let (low, high) = ratios().fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), r| (l.min(r), h.max(r)));
@@ -393,28 +389,29 @@ impl Model {
         }
     }
 
-    /// Fitted hyperparameters. The standard deviation of the noise is last. [`GprSettings::start`] has the same order.
+    /// Returns the fitted hyperparameters in the order of [`GprSettings::start`]. The standard deviation of the noise
+    /// is last.
     pub fn hyperparameters(&self) -> Vec<Hyperparameter> {
         let plan = Plan::new(&self.spec.kernel, self.spec.dimensions, self.spec.ard);
         let named = plan.parameters.into_iter().zip(&self.theta);
         named.map(|(p, value)| Hyperparameter { name: p.name, value: value.exp() * p.role.unit(&self.scale) }).collect()
     }
 
-    /// Natural logarithm of the density of the training targets, in their units. For [`Form::Nearest`], this is the
-    /// density of the approximation.
+    /// Returns the log density of the training targets, in their units. For [`Form::Nearest`], it is the density of the
+    /// approximation.
     pub fn log_marginal_likelihood(&self) -> f64 {
         self.outcome.log_likelihood - self.rows() as f64 * self.scale.target_deviation.ln()
     }
 
-    /// Half width of the 95 % interval, divided by the standard deviation of a measurement. The factor is 1.96 for
+    /// Returns the half width of the 95 % interval divided by the standard deviation of a measurement: 1.96 for
     /// Gaussian residuals. With [`GprSettings::calibrate`], the factor comes from leave-one-out predictions of training
-    /// rows, and applies to a row whose neighbours have residuals of average size. If the residuals of nearby training
-    /// rows are larger (smaller) than average, the interval of a prediction is wider (narrower).
+    /// rows. It is the average: the interval is wider where the residuals of nearby training rows are large, and
+    /// narrower where they are small.
     pub fn interval_factor(&self) -> f64 {
         self.calibration.factor
     }
 
-    /// Number of training rows.
+    /// Returns the number of training rows.
     pub fn rows(&self) -> usize {
         self.posterior.data().len()
     }

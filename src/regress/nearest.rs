@@ -2,24 +2,23 @@
 //!
 //! The rows are put in a seeded random order. The density of all rows is then a product with one term per row: the
 //! density of the row given all its predecessors. In the approximation, each term is the density of the row given only
-//! its `m` nearest predecessors. The approximation is a proper density. If every row has at most `m` predecessors, the
-//! approximation is exact. Each term needs a Cholesky factor of a matrix with about `m` rows, regardless of the number
-//! of training rows. The density is conditional on the measurements of the predecessors, which include noise.
+//! its `m` nearest predecessors. The approximation is a proper density. It is exact if every row has at most `m`
+//! predecessors. Each term needs a Cholesky factor of a matrix with about `m` rows, regardless of the number of
+//! training rows. The density is conditional on measurements, which include noise.
 //!
-//! For one term, let K be the covariance matrix of the neighbours and the row, with the row last. Let `q = K^-1
-//! e_last`, `A = K^-1 [y H]` and `a = A (1, -beta)'`. The conditional variance of the row is then `1/q_n`, and its
-//! residual is `a_n/q_n`. Therefore:
+//! For one term, let K be the covariance matrix of the neighbours and the row, with the row last. Let `q = K^-1 e_n`
+//! with the last unit vector `e_n`, `A = K^-1 [y H]` and `a = A (1, -beta)'`. The conditional variance of the row is
+//! then `1/q_n`, and its residual is `a_n/q_n`. Therefore:
 //!
 //! `-log p = -1/2 ln q_n + 1/2 a_n^2 / q_n + 1/2 ln 2 pi`,
 //!
 //! `-d log p = c q' dK q - (a_n/q_n) q' dK a`, with `c = 1/2 (1 + a_n^2/q_n) / q_n`.
 //!
-//! The coefficients beta are generalised least-squares coefficients. The derivative with respect to beta is therefore
-//! 0.
+//! The coefficients beta are generalised least-squares coefficients, so the derivative with respect to beta is 0.
 //!
-//! The search for hyperparameters may use a seeded subset of the terms. The neighbours of these terms are selected
-//! among all rows, so the sum over the subset gives an unbiased estimate of the sum over all terms. If the length
-//! scales have changed the order of distances, the neighbours are selected again.
+//! The search for hyperparameters may use a seeded subset of the terms. Neighbours are selected among all rows, so the
+//! sum over the subset gives an unbiased estimate of the sum over all terms. If the length scales have changed the
+//! order of distances, the neighbours are selected again.
 //!
 //! Input: standardised rows and hyperparameters. Output: likelihood, gradient and predictions. If a covariance matrix
 //! is not positive definite even with the largest jitter, the result is an error.
@@ -39,14 +38,12 @@ use super::scale::StandardisedRows;
 /// Number of rows per task. It is fixed, so that the rounding of sums does not depend on the number of threads.
 const CHUNK: usize = 64;
 
-/// The rows of the terms, and the neighbours of each row.
 #[derive(Debug, Clone)]
 pub(super) struct ConditionalFactors {
     pub rows: Vec<u32>,
     neighbours: Vec<Vec<u32>>,
 }
 
-/// Sums over the terms.
 pub(super) struct LikelihoodSums {
     /// Negative log density of the rows.
     pub value: f64,
@@ -55,15 +52,14 @@ pub(super) struct LikelihoodSums {
     pub jitter: Jitter,
 }
 
-/// A batch of terms. `g` is the sum of the terms' contributions to `[y H]' K^-1 [y H]`. `log` is half the sum of
-/// `ln(2 pi variance)` over the terms.
+/// A batch of terms. `g` sums their contributions to `[y H]' K^-1 [y H]`. `log` sums half of `ln(2 pi variance)`.
 struct FactorBatch {
     factors: Vec<ConditionalFactor>,
     g: Vec<f64>,
     log: f64,
 }
 
-/// What the first pass computes for one term. The second pass, which computes the gradient, uses it.
+/// Results for one term, which the computation of the gradient uses again.
 struct ConditionalFactor {
     q: Vec<f64>,
     /// `K^-1 [y H]`, column-major.
@@ -72,7 +68,6 @@ struct ConditionalFactor {
 }
 
 impl ConditionalFactors {
-    /// Finds the neighbours of each given row among its predecessors.
     pub(super) fn new(data: &StandardisedRows, rows: Vec<u32>, metric: &[f64], neighbours: usize) -> Self {
         let tree = KdTree::new(&data.inputs, metric);
         let of = |row: &u32| tree.nearest(data.row(*row as usize), neighbours, *row as usize, None);
@@ -80,7 +75,7 @@ impl ConditionalFactors {
         Self { rows, neighbours }
     }
 
-    /// Returns the sums over all terms. The gradient is computed only if it is requested.
+    /// Returns the sums over all terms. The gradient is computed only on request.
     pub(super) fn sums(
         &self,
         data: &StandardisedRows,
@@ -139,12 +134,11 @@ impl ConditionalFactors {
     }
 }
 
-/// Working memory of one thread.
 struct Scratch<'a> {
     data: &'a StandardisedRows,
     covariance: &'a Covariance,
     /// Squared differences of all pairs of rows below the diagonal (column-major). One more pair at the end has the
-    /// difference 0 and stands for the diagonal.
+    /// difference 0 and represents the diagonal.
     squares: Vec<f64>,
     matrix: Vec<f64>,
     weights: Vec<f64>,
@@ -232,9 +226,9 @@ impl<'a> Scratch<'a> {
     }
 }
 
-/// Replaces `matrix` by the lower Cholesky factor (column-major) of the covariance matrix. The covariance matrix has
-/// the kernel values in its lower triangle, and the sum of prior variance, jitter and noise variance on its diagonal.
-/// Returns the jitter, as a fraction of the prior variance.
+/// Replaces `matrix` by the lower Cholesky factor (column-major) of the covariance matrix. `kernel` is the lower
+/// triangle of the covariance matrix without its diagonal. The diagonal is the sum of prior variance, jitter and noise
+/// variance. Returns the jitter, as a fraction of the prior variance.
 fn factorise(matrix: &mut Vec<f64>, kernel: &[f64], n: usize, covariance: &Covariance) -> Result<f64, RegressionError> {
     matrix.resize(n * n, 0.0);
     until_positive(|jitter| {
@@ -255,8 +249,7 @@ fn cholesky(matrix: &mut [f64], n: usize) -> bool {
     for j in 0..n {
         let (before, rest) = matrix.split_at_mut(j * n);
         let column = &mut rest[j..n];
-        // Four earlier columns are subtracted at a time, because loading and storing the current column dominates the
-        // cost.
+        // Loading and storing the current column dominates the cost, so four earlier columns are subtracted at a time.
         let mut k = 0;
         while k + 4 <= j {
             let c = |i: usize| &before[(k + i) * n + j..(k + i + 1) * n];
@@ -304,7 +297,6 @@ fn backward(matrix: &[f64], b: &mut [f64]) {
     }
 }
 
-/// State for predictions.
 #[derive(Debug, Clone)]
 pub(super) struct Posterior {
     pub data: StandardisedRows,
@@ -328,7 +320,7 @@ impl Posterior {
     }
 
     /// Returns mean and variance of the function at standardised rows. If `excluded` is given, the prediction of row
-    /// `k` does not use the training row `excluded[k]`.
+    /// `k` ignores the training row `excluded[k]`.
     pub(super) fn predict(
         &self,
         queries: &[f64],

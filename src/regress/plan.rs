@@ -1,10 +1,10 @@
-//! Converts a kernel to a plan, which can be evaluated fast. All parameters are in one vector. The plan computes the
-//! kernel's values over a block of row pairs. The plan also computes the exact derivatives of a weighted sum of these
-//! values with respect to every parameter (reverse-mode differentiation).
+//! Converts a kernel to a plan, which can be evaluated fast. The plan computes the kernel's values over a block of row
+//! pairs. It also computes the exact derivatives of a weighted sum of these values with respect to every parameter
+//! (reverse-mode differentiation).
 //!
 //! A block of `count` pairs is given as *squares*: for each input in turn, `count` squared differences. The parameters
-//! are natural logarithms of length scales, of `alpha`, and of standard deviations. The standard deviation of the noise
-//! is always the last parameter. Inputs are not checked; NaN gives NaN.
+//! are natural logarithms of length scales, of `alpha`, and of standard deviations, in one vector. The standard
+//! deviation of the noise is always the last parameter. Inputs are not checked; NaN gives NaN.
 
 use faer::traits::pulp::Arch;
 
@@ -12,7 +12,6 @@ use super::kernel::{Kernel, Node, Shape};
 use super::scale::Scale;
 use super::vector_math;
 
-/// Kind of a parameter.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum ParameterRole {
     Length,
@@ -22,13 +21,12 @@ pub(super) enum ParameterRole {
 }
 
 impl ParameterRole {
-    /// Factor from standardised units to the caller's units.
+    /// Returns the factor from standardised units to the caller's units.
     pub(super) fn unit(self, scale: &Scale) -> f64 {
         if matches!(self, Self::Signal | Self::Noise) { scale.target_deviation } else { 1.0 }
     }
 }
 
-/// The kind of a parameter, and its name in reports.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Parameter {
     pub role: ParameterRole,
@@ -65,7 +63,7 @@ pub(super) struct Plan {
 #[derive(Debug, Clone)]
 pub(super) struct Covariance {
     pub plan: Plan,
-    /// The parameters of each shape, converted to the form that the loops use.
+    /// Parameters of each shape in the form that the loops use.
     leaves: Vec<LeafValues>,
     /// Variance of the function at a point.
     pub prior_variance: f64,
@@ -86,7 +84,7 @@ struct LeafValues {
 pub(super) struct Work {
     values: Vec<Vec<f64>>,
     adjoints: Vec<Vec<f64>>,
-    /// For each shape, the derivatives of the values with respect to the squared distance. `alphas` contains the
+    /// For each shape, the derivatives of the values with respect to the squared distance. `alphas` holds the
     /// derivatives with respect to ln alpha.
     slopes: Vec<Vec<f64>>,
     alphas: Vec<Vec<f64>>,
@@ -100,8 +98,7 @@ impl Plan {
         plan
     }
 
-    /// Adds the node's children and then the node. `scaled` states whether the node has its own standard deviation.
-    /// Returns the index of the node.
+    /// Adds the node after its children and returns its index. `scaled`: the node has its own standard deviation.
     fn add(&mut self, node: &Node, scaled: bool) -> usize {
         let step = match node {
             Node::Leaf(shape) => PlanStep::Leaf(self.add_leaf(*shape, scaled)),
@@ -147,7 +144,6 @@ impl Plan {
 }
 
 impl Covariance {
-    /// Combines the plan with the parameters `theta`.
     pub(super) fn new(plan: Plan, theta: &[f64]) -> Self {
         let leaves = plan.leaves.iter().map(|leaf| plan.leaf_values(leaf, theta)).collect();
         let noise_variance = (2.0 * theta[plan.parameters.len() - 1]).exp();
@@ -157,21 +153,20 @@ impl Covariance {
         covariance
     }
 
-    /// Weights of the inputs for the distance between rows. The weight of an input is the inverse of its shortest
-    /// length scale.
+    /// Returns the weights of the inputs for the distance between rows: the inverse of each input's shortest length
+    /// scale.
     pub(super) fn metric(&self) -> Vec<f64> {
         let of = |d: usize| self.leaves.iter().map(|leaf| leaf.inverse_squares[d].sqrt()).fold(0.0, f64::max);
         (0..self.plan.dimensions).map(of).collect()
     }
 
-    /// Evaluates the kernel over a block of pairs.
     pub(super) fn evaluate<'w>(&self, squares: &[f64], count: usize, work: &'w mut Work) -> &'w [f64] {
         self.forward(squares, count, work, false);
         &work.values[self.plan.steps.len() - 1][..count]
     }
 
-    /// Adds to `gradient` the derivatives of the weighted sum of the kernel values of a block of pairs, with respect to
-    /// every parameter except the noise.
+    /// Adds the derivatives of the weighted sum of a block's kernel values to `gradient`, for every parameter except
+    /// the noise.
     pub(super) fn add_gradient(&self, squares: &[f64], weights: &[f64], work: &mut Work, gradient: &mut [f64]) {
         let count = weights.len();
         self.forward(squares, count, work, true);
@@ -257,7 +252,7 @@ fn combine(below: &[Vec<f64>], children: &[usize], out: &mut [f64], join: impl F
     }
 }
 
-/// Sets the adjoint of each factor: the adjoint of the product, multiplied by the values of all other factors.
+/// Sets the adjoint of each factor: the adjoint of the product times the values of all other factors.
 fn product_adjoints(at: usize, children: &[usize], work: &mut Work) {
     let (below, here) = work.adjoints.split_at_mut(at);
     for child in children {
@@ -286,8 +281,8 @@ fn distances(inverse_squares: &[f64], squares: &[f64], out: &mut [f64]) {
 
 /// Replaces squared distances by kernel values. Fills `slopes` and `alphas`, unless they are empty.
 fn shape_values(shape: Shape, values: &LeafValues, out: &mut [f64], slopes: &mut [f64], alphas: &mut [f64]) {
-    /// Avoids a division by zero at distance 0. At this distance all squared differences are 0. The slope is later
-    /// multiplied by them, so it has no effect.
+    /// Avoids a division by zero at distance 0. The slope is later multiplied by the squared differences, which are 0
+    /// there, so its value has no effect.
     const TINY: f64 = 1e-150;
     let (s, a) = (values.variance, values.alpha);
     match shape {

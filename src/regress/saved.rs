@@ -2,9 +2,9 @@
 //!
 //! The text has two lines of JSON. The first line is a header with the version and a checksum of the second line. The
 //! second line is the model: its (standardised) rows, its hyperparameters, the result of its fit, and the ratios that
-//! calibrate its intervals. For [`Form::Nearest`], the line also has the coefficients of the mean function. Loading
-//! computes everything else again. For an exact model with n rows, loading needs time proportional to n^3. A damaged
-//! text and a text of another version give an error.
+//! calibrate its intervals. For [`Form::Nearest`], it also has the coefficients of the mean function. Everything else
+//! is computed on loading, which takes time proportional to n^3 for an exact model with n rows. A damaged text or
+//! another version gives an error.
 
 use serde::{Deserialize, Serialize};
 
@@ -17,9 +17,7 @@ use super::scale::{Scale, StandardisedRows};
 use super::settings::{Form, MAX_DIMENSIONS};
 use super::{exact, nearest};
 
-/// Name of the format in the header.
 const FORMAT: &str = "packwatch gaussian process";
-/// Version of the format. A text of any other version is rejected.
 const VERSION: u32 = 1;
 
 #[derive(Debug, Serialize, Deserialize)]
@@ -39,21 +37,21 @@ struct Body {
     outcome: FitOutcome,
     inputs: Vec<f64>,
     targets: Vec<f64>,
-    /// Coefficients of the mean function. An exact model does not store them or their covariance; loading computes them
-    /// again.
+    /// Coefficients of the mean function. An exact model stores neither the coefficients nor their covariance; loading
+    /// computes both again.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     beta: Vec<f64>,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     beta_covariance: Vec<f64>,
-    /// Numbers of the rows that were left out to calibrate the intervals. `ratios` has one entry per row: the residual
-    /// without sign, divided by the predicted standard deviation.
+    /// Rows that were left out to calibrate the intervals. `ratios` has one entry per row: |residual| / predicted
+    /// standard deviation.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     left_out: Vec<u32>,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     ratios: Vec<f64>,
 }
 
-/// Computes a 64-bit FNV-1a hash. It detects damage, but does not protect against deliberate changes.
+/// Computes a 64-bit FNV-1a hash. It detects damage but not deliberate changes.
 fn checksum(text: &str) -> String {
     let hash = text
         .bytes()

@@ -9,7 +9,6 @@ use super::basis::Basis;
 use super::error::RegressionError;
 use super::settings::{MAX_DIMENSIONS, TrainingRows};
 
-/// Mean and standard deviation of every input and of the target.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Scale {
@@ -19,7 +18,6 @@ pub(super) struct Scale {
     pub target_deviation: f64,
 }
 
-/// Rejects rows of wrong lengths or with non-finite numbers.
 pub(super) fn check(rows: &TrainingRows) -> Result<(), RegressionError> {
     let (d, n) = (rows.dimensions, rows.targets.len());
     if d == 0 || d > MAX_DIMENSIONS {
@@ -50,10 +48,10 @@ pub(super) fn check(rows: &TrainingRows) -> Result<(), RegressionError> {
     }
 }
 
-/// Mean and standard deviation of the values. If all values are equal, the result has a standard deviation of 1.
+/// Returns mean and standard deviation of the values. If all values are equal, the standard deviation is 1.
 fn moments(values: impl Iterator<Item = f64> + Clone) -> (f64, f64) {
     let count = values.clone().count() as f64;
-    // The mean is computed relative to the first value, because the sum of many equal values would be rounded.
+    // Subtracting the first value avoids rounding of the sum of many equal values.
     let first = values.clone().next().unwrap_or(0.0);
     let mean = first + values.clone().map(|v| v - first).sum::<f64>() / count;
     let deviation = (values.map(|v| (v - mean) * (v - mean)).sum::<f64>() / count).sqrt();

@@ -13,22 +13,21 @@ use super::minimise::{Evaluation, Minimum, SearchLimits, minimise};
 use super::plan::{Parameter, ParameterRole, Plan};
 use super::settings::{FitProgress, ProgressCallback};
 
-/// Returns the bounds of a parameter and the range of its random starts, in standardised units. Both ranges contain the
-/// values themselves, not their logarithms.
+/// Returns the bounds of a parameter and the range of its random starts, in standardised units (not logarithms).
 fn ranges(role: ParameterRole) -> [(f64, f64); 2] {
     match role {
         ParameterRole::Length => [(1e-4, 1e4), (0.05, 5.0)],
         ParameterRole::Alpha => [(1e-2, 1e3), (0.2, 5.0)],
-        // With larger values, the process would act like a mean function. The likelihood would then have a long ridge,
-        // which slows the search.
+        // With larger values, the process would act like a mean function, and a long ridge of the likelihood would slow
+        // the search.
         ParameterRole::Signal => [(1e-3, 2e1), (0.3, 3.0)],
         // The lower bound keeps the matrix of a smooth kernel positive definite despite rounding.
         ParameterRole::Noise => [(1e-4, 1e1), (0.03, 0.8)],
     }
 }
 
-/// Returns the logarithms of the bounds. `spread` is the typical standard deviation of an input (1 if the inputs are
-/// standardised).
+/// Returns the logarithms of the bounds. `spread` is the typical standard deviation of an input; 1 = the inputs are
+/// standardised.
 pub(super) fn log_bounds(plan: &Plan, spread: f64) -> (Vec<f64>, Vec<f64>) {
     let of = |parameter: &Parameter| {
         let [(low, high), _] = ranges(parameter.role);
@@ -51,7 +50,7 @@ pub(super) fn first_start(plan: &Plan, spread: f64) -> Vec<f64> {
     plan.parameters.iter().map(of).collect()
 }
 
-/// Returns the `k`-th random start that belongs to a seed; `k` counts from 1.
+/// Returns the `k`-th random start of a seed; `k` counts from 1.
 pub(super) fn random_start(plan: &Plan, spread: f64, seed: u64, k: usize) -> Vec<f64> {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     random.set_stream(k as u64);
@@ -64,7 +63,6 @@ pub(super) fn random_start(plan: &Plan, spread: f64, seed: u64, k: usize) -> Vec
     plan.parameters.iter().map(&mut of).collect()
 }
 
-/// Reports the progress of one search to the callback.
 pub(super) struct SearchMonitor<'a, 'w> {
     pub watcher: &'a mut ProgressCallback<'w>,
     pub progress: FitProgress,
@@ -82,7 +80,7 @@ impl SearchMonitor<'_, '_> {
     }
 }
 
-/// Searches from one start. A point at which a matrix cannot be factorised counts as a point without a value.
+/// Searches from one start. The objective has no value at a point where a matrix cannot be factorised.
 pub(super) fn descend(
     start: &[f64],
     (low, high): (&[f64], &[f64]),
@@ -90,7 +88,7 @@ pub(super) fn descend(
     monitor: &mut SearchMonitor,
     mut objective: impl FnMut(&[f64]) -> Result<(f64, Vec<f64>), RegressionError>,
 ) -> Result<Option<Minimum>, RegressionError> {
-    // The objective is divided by the number of rows, because the first step is as long as the gradient.
+    // The first step is as long as the gradient, so the objective is divided by the number of rows.
     let rows = monitor.rows as f64;
     let scale = 1.0 / rows;
     // The search ends after two successive steps that each lower the negative log likelihood per row by less than 5e-6.

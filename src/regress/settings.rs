@@ -1,6 +1,5 @@
-//! Defines training rows, and the settings, progress and limits of a fit.
-//!
-//! Input: values from the caller. [`fit`](super::fit) checks all of them and rejects values that are out of range.
+//! Defines training rows, and the settings, progress and limits of a fit. [`fit`](super::fit) rejects values that are
+//! out of range.
 
 use std::ops::ControlFlow;
 
@@ -12,33 +11,32 @@ use super::kernel::Kernel;
 
 /// Maximum number of inputs per row.
 pub const MAX_DIMENSIONS: usize = 256;
-/// Maximum number of rows of an exact fit. With this number a covariance matrix has 3.2 GB, and a search needs three
-/// matrices of this size.
+/// Maximum number of rows of an exact fit. A covariance matrix then has 3.2 GB, and a search needs three such matrices.
 pub const MAX_EXACT_ROWS: usize = 20_000;
 /// Maximum number of neighbours per row.
 pub const MAX_NEIGHBOURS: usize = 500;
 
-/// The rows that a model is fitted to.
+/// Rows to which a model is fitted.
 #[derive(Debug, Clone, Copy)]
 pub struct TrainingRows<'a> {
     /// Inputs, row-major.
     pub inputs: &'a [f64],
     /// Number of inputs per row.
     pub dimensions: usize,
-    /// The values that the model predicts, one per row.
+    /// Values that the model predicts, one per row.
     pub targets: &'a [f64],
-    /// Line of each row in its file, for error messages. If `lines` is empty, error messages count the rows from 1.
+    /// Line of each row in its file, for error messages; empty = error messages count the rows from 1.
     pub lines: &'a [u64],
 }
 
-/// How the covariance of the rows is computed.
+/// Computation of the covariance of the rows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum Form {
-    /// Uses the covariance of all pairs of rows, without approximation.
+    /// Uses all pairs of rows, without approximation.
     Exact,
-    /// Vecchia's approximation. The rows are put in a seeded random order. In this order, the density of a row depends
-    /// only on its nearest predecessors. A prediction depends only on the nearest training rows.
+    /// Vecchia's approximation. The rows are put in a seeded random order, in which the density of a row depends only
+    /// on its nearest predecessors. A prediction depends only on the nearest training rows.
     Nearest {
         /// Number of neighbours, 1 to 500.
         neighbours: usize,
@@ -46,7 +44,6 @@ pub enum Form {
 }
 
 impl Form {
-    /// Checks the number of neighbours and the number of rows against the limits.
     pub(super) fn check(self, rows: usize) -> Result<(), RegressionError> {
         let (what, found, most, advice) = match self {
             Self::Exact => ("rows of an exact fit", rows, MAX_EXACT_ROWS, "; use the form nearest"),
@@ -71,7 +68,7 @@ pub struct GprSettings {
     /// Whether inputs are standardised to mean 0 and standard deviation 1. If so, length scales are multiples of the
     /// inputs' standard deviations.
     pub standardise: bool,
-    /// Whether the covariance is exact or approximated with nearest neighbours.
+    /// Form of the covariance: exact, or approximated with nearest neighbours.
     pub form: Form,
     /// Number of additional searches, each from a seeded random start.
     pub restarts: usize,
@@ -79,19 +76,19 @@ pub struct GprSettings {
     pub seed: u64,
     /// Maximum number of steps of one search; 0 = the hyperparameters keep their initial values.
     pub max_iterations: usize,
-    /// Initial hyperparameters, in the order and units of [`Model::hyperparameters`](super::Model::hyperparameters). If
-    /// this list is empty, the start is derived from the rows.
+    /// Initial hyperparameters, in the order and units of [`Model::hyperparameters`](super::Model::hyperparameters);
+    /// empty = derived from the rows.
     pub start: Vec<f64>,
-    /// Whether the 95 % interval is calibrated with training rows. For the calibration, each training row is predicted
-    /// from all other training rows. Without calibration, the interval is Gaussian.
+    /// Whether the 95 % interval is calibrated by predicting each training row from all other training rows. Without
+    /// calibration, the interval is Gaussian.
     pub calibrate: bool,
     /// Number of threads, at least 1.
     pub threads: usize,
 }
 
 impl GprSettings {
-    /// Default settings: constant mean function, one length scale for all inputs, standardised inputs, one search. The
-    /// form is exact for up to 2,000 rows.
+    /// Returns the default settings: constant mean function, one length scale for all inputs, standardised inputs, one
+    /// search. The form is exact for up to 2,000 rows.
     pub fn new(kernel: Kernel, rows: usize) -> Self {
         Self {
             kernel,
@@ -112,22 +109,22 @@ impl GprSettings {
 /// Progress of a fit.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FitProgress {
-    /// Number of the fold that is being fitted, from 1. It is 1 outside a cross-validation.
+    /// Number of the current fold, from 1. It is 1 outside a cross-validation.
     pub fold: usize,
     /// Number of folds. It is 1 outside a cross-validation.
     pub folds: usize,
-    /// Number of the running search, from 1.
+    /// Number of the current search, from 1.
     pub search: usize,
     /// Number of searches.
     pub searches: usize,
-    /// Number of steps that this search has already made.
+    /// Number of steps that this search has made.
     pub iteration: usize,
     /// Maximum number of steps of a search.
     pub max_iterations: usize,
-    /// Best log marginal likelihood of this search, divided by the number of rows, for standardised targets.
+    /// Best log marginal likelihood of this search per row, for standardised targets.
     pub log_likelihood_per_row: f64,
 }
 
-/// A callback that is called before the first step and after each step of a search. If the callback returns `Break`,
-/// the fit ends with [`RegressionError::Cancelled`](super::RegressionError::Cancelled).
+/// Callback before the first step and after each step of a search. If it returns `Break`, the fit ends with
+/// [`RegressionError::Cancelled`](super::RegressionError::Cancelled).
 pub type ProgressCallback<'a> = dyn FnMut(FitProgress) -> ControlFlow<()> + 'a;

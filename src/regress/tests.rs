@@ -1,5 +1,4 @@
-//! Compares the exact form with the nearest-neighbour form, compares gradients with finite differences, and tests whole
-//! fits.
+//! Compares the exact form with the nearest-neighbour form and gradients with finite differences, and tests whole fits.
 
 use std::ops::ControlFlow;
 
@@ -17,8 +16,8 @@ fn noise(seed: u64) -> impl FnMut() -> f64 {
     }
 }
 
-/// Returns inputs and targets of rows. A target is a function of two inputs plus noise. The function is the sum of a
-/// constant, a sine of the first input, and half the product of both inputs.
+/// Returns inputs and targets of rows: 3, plus a sine of the first input, plus half the product of both inputs, plus
+/// noise.
 fn wavy_plane(rows: usize, seed: u64) -> (Vec<f64>, Vec<f64>) {
     let mut draw = noise(seed);
     let inputs: Vec<f64> = (0..2 * rows).map(|_| 2.0 * draw()).collect();
@@ -39,7 +38,6 @@ fn theta(plan: &Plan) -> Vec<f64> {
     (0..plan.parameters.len()).map(|k| -0.3 + 0.4 * (k as f64 * 2.3).sin()).collect()
 }
 
-/// Compares a gradient with finite differences of the value.
 fn check_gradient(plan: &Plan, name: &str, of: impl Fn(&[f64]) -> (f64, Vec<f64>)) {
     let at = theta(plan);
     let (_, gradient) = of(&at);
@@ -97,8 +95,7 @@ fn nearest_with_all_rows_agrees_with_exact() {
         let exact = fitted(Form::Exact, fixed);
         let queries: Vec<f64> = wavy_plane(40, 77).0;
         let expected = exact.predict(&queries).expect("finite");
-        // With 120 neighbours, each prediction uses all 120 rows, and each term of the likelihood uses all rows before
-        // it.
+        // With 120 neighbours, each prediction uses all 120 rows. Each term of the likelihood uses all earlier rows.
         let nearest = fitted(Form::Nearest { neighbours: 120 }, fixed);
         let likelihoods = (nearest.log_marginal_likelihood(), exact.log_marginal_likelihood());
         assert!((likelihoods.0 - likelihoods.1).abs() < 1e-5, "{likelihoods:?}");
@@ -272,7 +269,7 @@ fn numbers_too_large_to_square_are_rejected() {
     for form in [Form::Exact, Form::Nearest { neighbours: 30 }] {
         let model = fitted(form, |_| ());
         let predicted = model.predict(&[1.0, 1.0, 1e160, 0.0]).map(|all| all[1]);
-        // The result is either the prior, because the row is very distant, or an error that names the row.
+        // The row is very distant, so the result is either the prior or an error that names the row.
         match predicted {
             Ok(one) => assert!(one.mean.is_finite() && one.function_variance > 0.0, "{form:?}: {one:?}"),
             Err(fault) => assert!(fault.to_string().starts_with("inputs of row 2 = [1e160, 0.0]"), "{fault}"),

@@ -1,16 +1,16 @@
 //! Computes exponential and logarithm without branches, so that the compiler can vectorise the loops.
 //!
 //! Each function states the range of its argument. Within this range, the relative error of the result is a few 1e-16.
-//! Outside this range, the result is meaningless. The calling loops run inside `pulp`'s dispatcher (part of faer),
-//! which selects the widest vector instructions of the machine at run time. Multiplications and additions are not
-//! fused, so the results are the same on every machine.
+//! Outside, the result is meaningless. The calling loops run inside `pulp`'s dispatcher (part of faer), which selects
+//! the widest vector instructions of the machine at run time. Multiplications and additions are not fused, so that the
+//! results are the same on every machine.
 
 use std::f64::consts::LOG2_E;
 
-/// ln 2 as the sum of two numbers. The first number has so few bits that its product with an exponent is exact.
+/// ln 2 as the sum of two numbers. The first has so few bits that its product with an exponent is exact.
 const LN2_HIGH: f64 = 6.931_471_803_691_238e-1;
 const LN2_LOW: f64 = 1.908_214_929_270_587_7e-10;
-/// If this number is added to a small number, the low bits of the sum contain the nearest integer.
+/// After adding this number to a small number, the low bits of the sum contain the nearest integer.
 const ROUNDER: f64 = 6_755_399_441_055_744.0;
 /// 1/k! for k = 13 down to 0.
 const EXP_SERIES: [f64; 14] = [
@@ -30,10 +30,10 @@ const EXP_SERIES: [f64; 14] = [
     1.0,
 ];
 
-/// exp(x) for x <= 0. For x < -700, the result is exp(-700).
+/// Returns exp(x) for x <= 0. For x < -700, the result is exp(-700).
 #[inline(always)]
 pub(crate) fn exp(x: f64) -> f64 {
-    // The result for -700 is about 1e-304, which is far above the subnormal numbers.
+    // exp(-700) is about 1e-304, far above the subnormal numbers.
     let x = x.max(-700.0);
     let rounded = x * LOG2_E + ROUNDER;
     let whole = rounded - ROUNDER;
@@ -45,13 +45,13 @@ pub(crate) fn exp(x: f64) -> f64 {
     series * f64::from_bits(rounded.to_bits().wrapping_add(1023) << 52)
 }
 
-/// ln(x) for finite x >= 1.
+/// Returns ln(x) for finite x >= 1.
 #[inline(always)]
 pub(crate) fn ln(x: f64) -> f64 {
     const MANTISSA: u64 = (1 << 52) - 1;
     let bits = x.to_bits();
-    // The bits of `x` contain the exponent plus 1023. These bits, combined with the bits of 2^52, are the number
-    // 2^52 + 1023 + exponent. Subtracting 2^52 + 1023 gives the exponent as a number.
+    // The exponent bits of `x` (exponent + 1023), combined with the bits of 2^52, represent 2^52 + 1023 + exponent.
+    // Subtracting 2^52 + 1023 gives the exponent.
     let exponent = f64::from_bits((bits >> 52) | 0x4330_0000_0000_0000) - (4_503_599_627_370_496.0 + 1023.0);
     let mantissa = f64::from_bits((bits & MANTISSA) | 0x3ff0_0000_0000_0000);
     let halve = mantissa > std::f64::consts::SQRT_2;

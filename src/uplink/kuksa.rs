@@ -5,7 +5,7 @@
 //! Documents are never queued: the first batch of a connection has the values of the newest document. On `SIGTERM` and
 //! `SIGINT`, the program sends a batch without values and ends.
 //!
-//! | module | what lives there |
+//! | module | content |
 //! | --- | --- |
 //! | `settings` | the table `[kuksa]` |
 //! | `signals` | paths, datatypes and units; derivation of each value from a document |

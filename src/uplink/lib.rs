@@ -5,7 +5,7 @@
 //! hostile broker can therefore not delay the estimates, and the daemon needs no network library.
 //! `packwatch mqtt`, `packwatch kuksa`, `packwatch sovd` and `packwatch vss` start this program.
 //!
-//! | module | what lives there |
+//! | module | content |
 //! | --- | --- |
 //! | `files` | bounded reads of the settings file and of the files that it names |
 //! | `kuksa` | provider of a KUKSA databroker |

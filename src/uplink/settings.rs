@@ -33,7 +33,7 @@ pub struct Settings {
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct StatusSettings {
-    /// The daemon's status socket; the stream socket is next to it.
+    /// The daemon's status socket; the stream socket is in the same folder.
     pub socket: PathBuf,
 }
 

@@ -1,12 +1,12 @@
 //! `sovd`: serves the faults and the values of the battery as one component, in the style of ASAM SOVD 1.0 (ISO 17978-3).
 //!
-//! Input: settings, and status documents of the daemon. Output: JSON over HTTP/1.1 on a loopback address. Only reading is
-//! served: no authorization, locks, operations, modes or updates. While the daemon is silent, values and faults give an
-//! error, never an old value.
+//! Input: settings, and status documents of the daemon. Output: JSON over HTTP/1.1 on a loopback address. The server is
+//! read-only. It has no authorization, locks, operations, modes or updates. While the daemon is silent, values and
+//! faults give an error, never an old value.
 //!
-//! | module | what lives there |
+//! | module | content |
 //! | --- | --- |
-//! | `resources` | the resources: path and document to JSON or an error |
+//! | `resources` | converts path and document to JSON or an error |
 //! | `settings` | the table `[sovd]` |
 
 mod resources;

@@ -10,8 +10,8 @@ use tokio::sync::watch;
 /// The newest document, as a watched value; `None` = the daemon is silent.
 pub type Documents = watch::Receiver<Option<Box<StatusDocument>>>;
 
-/// Reads the stream next to the status socket `socket` in a task of the current runtime, until the last receiver is
-/// dropped.
+/// Reads the stream that belongs to the status socket `socket`, in a task of the current runtime, until the last
+/// receiver is dropped.
 pub fn follow(socket: &Path) -> Documents {
     let (sender, receiver) = watch::channel(None);
     let socket = socket.to_owned();

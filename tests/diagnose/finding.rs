@@ -3,7 +3,7 @@
 use packwatch_core::cell_faults::CellFaultKind;
 use packwatch_core::sim::FaultKind;
 
-/// The expected kind of finding. At present, every fault has one.
+/// The expected kind of finding.
 pub(crate) fn kind_of(fault: &FaultKind) -> Option<CellFaultKind> {
     match fault {
         FaultKind::Leak { .. } => Some(CellFaultKind::Leak),

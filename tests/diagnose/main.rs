@@ -1,14 +1,14 @@
 //! Measures how well the diagnosis finds faults in simulated packs: healthy packs, and packs with one fault each.
 //!
-//! `tests/diagnose/run [--quick] [--packs N] [--days N] [--period MS] [--jobs N] [--seed N] [--only WORD] [--list] [--write]`
+//! `tests/diagnose/run [--quick] [--packs N] [--days N] [--period MS] [--jobs N] [--seed N] [--only WORD] [--list]
+//! [--write]`
 //!
-//! A pack drives, parks with sleeping buses and charges every day (scenario `ev-day`). Its cells differ. Each kind of
-//! fault begins at a random time between 10 and 35 % of the simulated time. If the fault concerns a cell or a
-//! temperature sensor, the cell or sensor is random. Every fault is simulated with good, usual and poor sensors, and
-//! with three kinds of balancing: none, unreported, and reported by bits that show the bled cells.
-//! The program needs only the repository's cell model.
+//! A pack drives, parks with sleeping buses and charges every day (scenario `ev-day`). Each fault begins at a random
+//! time between 10 and 35 % of the simulated time, in a random cell or temperature sensor. Every fault is simulated
+//! with good, usual and poor sensors, and with three kinds of balancing: none, unreported, and reported by bits that
+//! show the bled cells.
 //!
-//! - `--packs`: total number of packs, distributed over the rows of the table, at least one per row
+//! - `--packs`: total number of packs, at least one per row of the table
 //! - `--days`, `--period`, `--jobs`, `--seed`: simulated days per pack; time between two readings, ms; number of
 //!   threads; seed of the first pack
 //! - `--quick`: one pack per fault, with usual sensors and unreported balancing
@@ -40,7 +40,6 @@ const SIZES: [PackSize; 2] = [PackSize { cells: 12, capacity_ah: 60.0 }, PackSiz
 const QUALITIES: [(&str, SensorQuality); 3] =
     [("good", SensorQuality::Good), ("usual", SensorQuality::Usual), ("poor", SensorQuality::Poor)];
 
-/// Index of the sensor quality that `--quick` uses.
 const QUICK_QUALITY: usize = 1;
 
 /// Kinds of faults: name, pack size, and fault text with placeholders for two cells (A, B) and a sensor (S).
@@ -70,9 +69,7 @@ const FAULTS: [(&str, usize, &str); 21] = [
 
 /// If the name of a fault has this suffix, the fault grows for ten days.
 const SLOWLY: &str = " in 10 days";
-/// Duration of the growth (s).
 const SLOW_S: f64 = 10.0 * 86_400.0;
-/// Number of steps of the growth.
 const SLOW_STEPS: u32 = 80;
 
 struct Options {
@@ -145,7 +142,7 @@ fn main() -> Result<(), String> {
     Ok(())
 }
 
-/// CPU time of this process since its start (s). Unlike wall-clock time, it does not depend on the load of the machine.
+/// CPU time of this process (s), which does not depend on the load of the machine.
 fn cpu_s() -> Option<f64> {
     const TICKS_PER_S: f64 = 100.0; // USER_HZ of Linux
     let stat = std::fs::read_to_string("/proc/self/stat").ok()?;
@@ -169,7 +166,8 @@ fn cases(options: &Options) -> Result<Vec<(Row, Case)>, String> {
     for i in 0..each {
         for row @ (f, q, balancing) in rows.iter().copied() {
             let (name, size, text) = FAULTS[f];
-            // Use the same seeds in every row. Rows of equal pack size differ only in fault, sensors and balancing.
+            // Use the same seeds in every row. Rows of equal pack size then differ only in fault, sensors and
+            // balancing.
             let seed = options.seed + i as u64;
             let (size, quality, days) = (SIZES[size], QUALITIES[q].1, options.days);
             let fault = fault_of(text, size, seed, days)?;
@@ -228,7 +226,7 @@ fn run_all(cases: &[(Row, Case)], configs: &[MonitorConfig], options: &Options) 
     scores.into_inner().unwrap_or_default()
 }
 
-/// Prints the findings of another kind than the fault's, and all findings before the fault began.
+/// Prints the unexpected findings: those of another kind than the fault's, and all findings before the fault began.
 fn list((f, q, balancing): Row, case: &Case, seen: &[FirstFinding]) {
     let (from_s, kind) =
         case.fault().map_or((f64::INFINITY, None), |fault| (fault.from_s, finding::kind_of(&fault.kind)));

@@ -19,9 +19,9 @@ use crate::finding::kind_of;
 const SLEEP_GAP_S: f64 = 30.0;
 /// Interval between two checks of the findings while the buses are awake (s).
 const LOOK_S: f64 = 300.0;
-/// A discharge current above this value, 1/h (current divided by capacity), counts as driving.
+/// A discharge current above this value counts as driving (current divided by capacity, 1/h).
 const DRIVE_PER_H: f64 = 0.05;
-/// If the pack has not been driving for longer than this (s), the next drive begins with the next driving current.
+/// If the pack has not been driving for longer than this (s), the next driving current begins a new drive.
 const PARKED_S: f64 = 1800.0;
 /// Cells per temperature sensor.
 pub(crate) const CELLS_PER_SENSOR: u16 = 4;
@@ -74,13 +74,12 @@ pub(crate) struct Case {
 pub(crate) struct FirstFinding {
     /// Time since the start of the simulation (s).
     pub(crate) at_s: f64,
-    /// Number of drives with the fault so far (see `Drives`).
+    /// Number of drives with the fault until this time (see `Drives`).
     pub(crate) drives: u32,
     pub(crate) found: CellFault,
 }
 
-/// Writes a pack's configuration to `folder` and loads it. In this configuration, the BMS reports which cells it
-/// bleeds.
+/// Writes a pack's configuration to `folder` and loads it. It contains the bits with which the BMS reports bled cells.
 pub(crate) fn configuration(folder: &Path, size: PackSize) -> Result<MonitorConfig, String> {
     let sensors = size.cells.div_ceil(CELLS_PER_SENSOR);
     let write = |name: &str, text: String| std::fs::write(folder.join(name), text).map_err(|e| e.to_string());
@@ -208,8 +207,8 @@ impl Case {
         }
     }
 
-    /// Runs the pack. Returns the findings in the order of their first occurrence. If a finding correctly describes one
-    /// of the sensors' own errors, it is omitted, unless its kind is the expected one.
+    /// Returns the findings in the order of their first occurrence. A finding that correctly describes a sensor's own
+    /// error is omitted, unless its kind is expected.
     pub(crate) fn run(&self, config: &MonitorConfig) -> Vec<FirstFinding> {
         let mut sim = self.simulation(config);
         let encoder = InputEncoder::new(&config.input);
@@ -263,7 +262,6 @@ fn median(values: &[f64]) -> f64 {
     0.5 * (sorted[(sorted.len() - 1) / 2] + sorted[sorted.len() / 2])
 }
 
-/// Collects the first occurrence of each finding (kind and cells).
 #[derive(Debug, Default)]
 struct FindingHistory {
     first: Vec<FirstFinding>,
@@ -289,7 +287,6 @@ struct Drives {
 }
 
 impl Drives {
-    /// Handles a reading with a driving current.
     fn note(&mut self, now_s: f64, from_s: f64) {
         let is_new = self.last_s.replace(now_s).is_none_or(|last_s| now_s - last_s > PARKED_S);
         if now_s >= from_s && (is_new || self.begun == 0) {

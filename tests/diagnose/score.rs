@@ -7,7 +7,6 @@ use crate::finding::kind_of;
 use crate::pack::{CELLS_PER_SENSOR, Case, FirstFinding};
 
 const DAY_S: f64 = 86_400.0;
-/// Days in a month.
 const MONTH_DAYS: f64 = 30.0;
 
 /// Results of one row of the table.
@@ -23,7 +22,7 @@ pub(crate) struct Score {
     wrong_cell: u32,
     /// Packs with a finding of another kind after the start of the fault.
     wrong_kind: u32,
-    /// Packs with any finding after the start of the fault.
+    /// Packs with at least one finding after the start of the fault.
     any: u32,
     /// Findings before the start of the fault, and all findings in healthy packs.
     false_findings: u32,
@@ -68,7 +67,7 @@ impl Score {
         )
     }
 
-    /// Delay (days), within which the fault was found in the share `quantile` of all packs; `-` if it was found in
+    /// Delay (days) within which the fault was found in the fraction `quantile` of all packs. `-` if it was found in
     /// fewer packs.
     fn delay(&self, quantile: f64) -> String {
         let mut delays = self.delays_days.clone();
@@ -89,15 +88,14 @@ impl Score {
 }
 
 /// Mean of a Poisson distribution that gives `count` or fewer in 5 % of cases. Uses the approximation of Wilson and
-/// Hilferty, which is 1 % too low at `count` 0.
+/// Hilferty, which is 1 % too low if `count` is 0.
 fn poisson_upper(count: f64) -> f64 {
     const NORMAL_95: f64 = 1.645;
     let n = count + 1.0;
     n * (1.0 - 1.0 / (9.0 * n) + NORMAL_95 / (3.0 * n.sqrt())).powi(3)
 }
 
-/// Ranges of cells (first, last) that a correct finding may name. Empty if a correct finding names no cells, because it
-/// concerns the whole pack.
+/// Ranges of cells (first, last) that a correct finding may name. Empty if the fault concerns the whole pack.
 fn places(fault: &FaultKind) -> Vec<(CellIndex, CellIndex)> {
     let sensor = |i: u16| (CellIndex(i * CELLS_PER_SENSOR), CellIndex((i + 1) * CELLS_PER_SENSOR - 1));
     match *fault {

@@ -1,6 +1,6 @@
-//! A noisy value stays near its alarm threshold for a day, except in the first and the last hour. The tests run the
-//! whole core, from input frames to alarm frames. They expect one raise and one clear, in the events and on the bus. As
-//! a control, the alarm must flicker on the same day without hysteresis and debounce.
+//! Tests an alarm whose noisy value stays near the threshold for a day. The day's input frames run through the whole
+//! core. The alarm must be raised and cleared exactly once. As a control, the same alarm without hysteresis and
+//! debounce must flicker.
 
 use std::path::Path;
 
@@ -17,14 +17,13 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 
 const DAY_S: u32 = 86_400;
-/// Time in which the value approaches its threshold at the start of the day, and leaves it at the end (s).
+/// The value approaches its threshold in the first hour of the day and leaves it in the last hour (s).
 const HOUR_S: f64 = 3600.0;
 const SLEEP_GAP_S: f64 = 30.0;
 /// Raw values of the alarm states, as `config/packwatch.dbc` defines them.
 const ACTIVE: u64 = 1;
 const CLEARED: u64 = 2;
 
-/// One cell as in `config/paper.toml`, with the alarm under test.
 fn configuration(alarm: &str) -> MonitorConfig {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
     let paper = std::fs::read_to_string(folder.join("paper.toml")).unwrap();
@@ -41,17 +40,15 @@ fn configuration(alarm: &str) -> MonitorConfig {
 /// Readings of one second: current in A (positive = discharge), voltage in V, temperature in degrees C.
 type Second = (f64, f64, f64);
 
-/// Alarm changes and alarm frames of the tested rule during one day.
 #[derive(Debug, PartialEq)]
 struct Day {
     raised: usize,
     cleared: usize,
-    /// States in the rule's alarm frames. Consecutive frames with the same state give one entry.
+    /// Alarm states on the bus, without consecutive duplicates.
     states: Vec<u64>,
     frames: usize,
 }
 
-/// Reads the rule's number and the state from an alarm frame, using the shipped DBC.
 struct AlarmReader {
     id: CanId,
     rule: SignalPlan,
@@ -67,7 +64,7 @@ impl AlarmReader {
     }
 }
 
-/// Simulates a day with readings once per second and the driver's ticks between the readings.
+/// Simulates a day with one reading per second and the core's ticks between the readings.
 fn day(config: MonitorConfig, rule: Rule, mut second: impl FnMut(&MonitorConfig, f64) -> Second) -> Day {
     let reader = AlarmReader::new();
     let encoder = InputEncoder::new(&config.input);
@@ -116,7 +113,8 @@ impl Day {
         }
     }
 
-    /// Expects one raise, one clear, and more than 70,000 alarm frames. A raised alarm is sent once per second.
+    /// Expects one raise and one clear. A raised alarm is sent once per second, so the day has more than 70,000 alarm
+    /// frames.
     fn assert_quiet(&self) {
         assert_eq!((self.raised, self.cleared), (1, 1));
         assert_eq!(self.states, [ACTIVE, CLEARED], "alarm states on the bus");
@@ -130,7 +128,7 @@ impl Day {
     }
 }
 
-/// Approximate standard normal noise: the sum of twelve uniform numbers, minus 6.
+/// Approximately normal noise: the sum of twelve uniform numbers, minus 6.
 struct Noise(ChaCha8Rng);
 
 impl Noise {
@@ -143,8 +141,8 @@ impl Noise {
     }
 }
 
-/// Scaled distance of the value from its threshold: 1 at the start and the end of the day, 0 from one hour after the
-/// start to one hour before the end.
+/// Scaled distance of the value from its threshold: 1 at both ends of the day. It falls to 0 in the first hour and
+/// rises to 1 in the last hour.
 fn distance_from_threshold(t: f64) -> f64 {
     let to_end = (f64::from(DAY_S) - t).min(t);
     (1.0 - to_end / HOUR_S).max(0.0)
@@ -155,8 +153,8 @@ fn wander(t: f64) -> f64 {
     (0.6 * (t / 160.0).sin() + 0.4 * (t / 1340.0).sin()).clamp(-1.0, 1.0)
 }
 
-/// A day with a noisy temperature sensor (standard deviation 0.7 C). The cell starts and ends the day at about 40 C.
-/// Except in the first and the last hour, its temperature stays within 1 C of 50 C.
+/// A day with a noisy temperature sensor (standard deviation 0.7 C). The cell is at about 40 C at both ends of the day.
+/// From one hour after the start to one hour before the end, it stays within 1 C of 50 C.
 fn temperature_day(alarm: &str) -> Day {
     let mut noise = Noise::new(1);
     day(configuration(alarm), Rule::TemperatureHigh, |_, t| {
@@ -164,18 +162,16 @@ fn temperature_day(alarm: &str) -> Day {
     })
 }
 
-/// In the first hour, a cell is discharged to 10 % SOC. Its SOC then oscillates around 10 % (amplitude 0.6 %, period
-/// four minutes). In the last hour, the cell is charged. Both sensors are noisy (50 mA, 10 mV). The rule compares the
-/// filter's estimate, which is smoother than the readings.
+/// A day with noisy sensors (50 mA, 10 mV). In the first hour, the cell is discharged to 10 % SOC. Its SOC then
+/// oscillates around 10 % (amplitude 0.6 %, period four minutes). In the last hour, the cell is charged.
 fn soc_day(alarm: &str) -> Day {
     let (mut noise, mut soc) = (Noise::new(2), 0.3);
     day(configuration(alarm), Rule::SocLow, |config, t| {
         let model = &config.model;
         let target = 0.1 + 0.2 * distance_from_threshold(t) + 0.006 * (t / 40.0).sin();
-        // Current that reaches the target within this second.
         let current_a = (soc - target) * model.capacity_ah * 3600.0;
         soc = soc_after(soc, current_a, model.capacity_ah);
-        // The branch voltages (in all 0.025 ohm) are in equilibrium with the current.
+        // The RC branches (together 0.025 ohm) have settled at this current.
         let place = model.grid_position(soc, 25.0);
         let voltage_v = terminal_v(model, &place, 1.0, 0.025 * current_a, current_a);
         (current_a + 0.05 * noise.next(), voltage_v + 0.01 * noise.next(), 25.0)

@@ -1,6 +1,6 @@
-//! Mixes authenticated commands with a million hostile frames. Forged, replayed, delayed and outdated frames must never
-//! be executed. A genuine command must be executed, at the latest when its sender repeats it. A journal can be
-//! replayed without the key. Sent frames never reuse a freshness value.
+//! Tests command authentication against an attacker, across restarts, and in a journal replay. Forged, replayed,
+//! delayed and outdated frames must never be executed. A genuine command must be executed, at the latest when its
+//! sender repeats it.
 
 mod ecu;
 
@@ -14,14 +14,13 @@ use rand_chacha::ChaCha8Rng;
 
 use ecu::{Daemon, Ecu, FRESHNESS, REPLY, config, frame_of, key};
 
-/// Number of the newest frames that an attacker keeps.
 const RECORDED: usize = 512;
 
-/// An attacker who hears all traffic but has no key.
+/// An attacker who receives all traffic but has no key.
 struct Attacker {
     rng: ChaCha8Rng,
     recorded: Vec<Frame>,
-    /// Genuine frames that the attacker withheld, with their creation times.
+    /// Genuine frames that never arrived, with their creation times.
     withheld: Vec<(i64, Frame)>,
     frames: u64,
     of_kind: [u64; 6],
@@ -35,7 +34,8 @@ impl Attacker {
         self.recorded.push(frame);
     }
 
-    /// A frame that must not be executed. `announced`: the last announcement; `other`: a sender with another key.
+    /// Returns a frame that must not be executed. `announced` is the last announcement; `other` is a sender with
+    /// another key.
     fn frame(&mut self, now_ms: i64, announced: &Frame, other: &Ecu) -> Option<Frame> {
         let kind = self.rng.random_range(0..6);
         let fresh = freshness_of(announced) + self.rng.random_range(0..16);
@@ -54,7 +54,7 @@ impl Attacker {
                 frame_of(&payload)
             }
             3 => {
-                // A guess: correct command, fresh value, random authenticator.
+                // A correct command with a fresh value but a random authenticator.
                 let mut payload = other.encode_command(3, 2047, fresh).data().to_vec();
                 other.authentication.write_mac(&mut payload, self.rng.random::<u128>().to_be_bytes());
                 frame_of(&payload)
@@ -75,7 +75,7 @@ impl Attacker {
     }
 }
 
-/// Delivers the daemon's sent frames to the ECU. Returns the last announcement, if there was one.
+/// Delivers the daemon's sent frames to the ECU. Returns the last announcement.
 fn deliver_sent_frames(daemon: &Daemon, ecu: &mut Ecu) -> Option<Frame> {
     daemon.sent.iter().for_each(|frame| ecu.handle_frame(frame));
     daemon.sent.iter().rev().find(|frame| frame.id() == CanId::standard(FRESHNESS).unwrap()).copied()
@@ -103,7 +103,7 @@ fn attack(profile: Profile, frames: u64, seed: u64) {
         if attacker.rng.random_range(0..40) == 0
             && let Some(frame) = ecu.command(attacker.rng.random_range(1..=3), 2047)
         {
-            // A sender that repeats a rejected command with the next freshness value succeeds.
+            // If the command is rejected, repeat it with the next freshness value. The repetition must be executed.
             let mut sent = frame;
             let mut is_executed = daemon.receive(&sent);
             if !is_executed {
@@ -134,8 +134,7 @@ fn attack(profile: Profile, frames: u64, seed: u64) {
             }
         }
         if round % 300 == 0 {
-            // Kill the daemon and restart it from a state up to six seconds old. The downtime follows from the clock,
-            // is unknown, or is stated as 3 s. The clock may have been set back.
+            // Restart from a state up to six seconds old. In one of four restarts the clock has been set back.
             let downtime = [Downtime::AsStamped, Downtime::Unknown, Downtime::Seconds(3.0)][(round / 300 % 3) as usize];
             let away_ms = [50, 30_000, -4_000, 4_000_000][(round / 300 % 4) as usize];
             daemon.restart(stored.clone(), downtime, away_ms);
@@ -237,7 +236,6 @@ fn journal_replay_without_key_equals_live_run() {
         assert!(!daemon.receive(&frame));
     }
     let live = serde_json::to_string(&daemon.monitor.snapshot()).unwrap();
-    // Replay the inputs as a journal stores them, without the key.
     let (mut replay, mut out) = (Monitor::new(config), Outputs::default());
     for (ms, frame) in daemon.journal.take().unwrap() {
         let time = Timestamp::from_nanos(ms * 1_000_000);
@@ -263,7 +261,7 @@ fn announcement_expires_after_two_seconds() {
         daemon.pass(1000);
         daemon.sent.iter().for_each(|frame| ecu.handle_frame(frame));
         daemon.pass(20);
-        // Stop the ticks until about `stalled_ms` after the announcement, as if the loop hung.
+        // Send no ticks until about `stalled_ms` after the announcement, as if the main loop had stalled.
         let frame = ecu.command(1, 2047).unwrap();
         daemon.ms += stalled_ms - 20;
         assert_eq!(daemon.receive(&frame), is_executed, "{stalled_ms}");
@@ -294,8 +292,8 @@ fn sent_freshness_rises_across_restarts() {
             daemon.pass(1000);
             for frame in daemon.sent.iter().filter(|frame| matches!(frame.id().raw(), 0x6B0 | 0x6B4)) {
                 let (authentication, last) = (of(frame.id().raw()), &mut last[usize::from(frame.id().raw() == 0x6B0)]);
-                // Reconstruct the freshness as a receiver does: of the values with the received low bits, the lowest
-                // one above the last freshness.
+                // Reconstruct the freshness as a receiver does: the lowest value above the last freshness that has the
+                // received low bits.
                 let sent = authentication.sent_freshness(frame.data()).unwrap();
                 let freshness = *last + 1 + (sent.wrapping_sub(*last + 1) & 0xFFFF_FFFF);
                 let freshness =

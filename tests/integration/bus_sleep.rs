@@ -1,5 +1,5 @@
-//! If all buses of a parked vehicle fall silent at once, the silence is not a fault. Silence under load is a fault, and
-//! so is the silence of a single input.
+//! Tests the silence of buses. If all buses of a parked vehicle fall silent at once, that is not a fault. Silence under
+//! load and the silence of a single input are faults.
 
 use packwatch::alarm::{Change, Rule};
 use packwatch::can::{CanId, Frame};
@@ -160,9 +160,8 @@ fn silent_cells_among_active_inputs_raise_fault() {
     let mut rig = parked();
     rig.voltages_v = [None; 2];
     rig.seconds(60);
-    // Four alarms: two cells with two severities each.
     assert_eq!((sleeps(&rig.events), rig.changes(Rule::InputMissing)), (vec![], vec![Change::Raised; 4]));
-    // The other inputs fall silent later, so the buses count as asleep. The missing cells stay missing.
+    // When the other inputs also fall silent, the buses count as asleep. The missing cells stay missing.
     fall_silent(&mut rig);
     rig.seconds(60);
     assert_eq!((sleeps(&rig.events).len(), rig.changes(Rule::InputMissing).len()), (1, 4));

@@ -28,7 +28,6 @@ fn frames(folder: &Path) -> Vec<(BusIndex, Frame)> {
     text.lines().map(frame).collect()
 }
 
-/// The DBC's pack current and voltage, bound to one interface.
 fn pack(folder: &Path, bus: u8) -> InputMap {
     let db = Database::parse_bytes(&std::fs::read(folder.join("kona_pcan.dbc")).unwrap()).unwrap();
     assert_eq!(db.messages.len(), 107);
@@ -42,7 +41,6 @@ fn pack(folder: &Path, bus: u8) -> InputMap {
     ])
 }
 
-/// Currents and voltages of the whole log, decoded with one map.
 fn read(map: &InputMap, frames: &[(BusIndex, Frame)]) -> (Vec<f64>, Vec<f64>) {
     let (mut currents, mut voltages) = (Vec::new(), Vec::new());
     for (bus, frame) in frames {
@@ -87,8 +85,7 @@ fn kona_pack_signals_come_from_powertrain_bus_only() {
 #[test]
 #[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
 fn same_identifier_on_other_bus_decodes_wrongly() {
-    // Shows why a binding includes the interface: a decoder that looks only at the identifier would also return these
-    // wrong values.
+    // A decoder that looks only at the identifier, not at the interface, would return these wrong values.
     let folder = measured::path("can_ev");
     let (currents, _) = read(&pack(&folder, 1), &frames(&folder));
     assert_eq!(currents.len(), 108);

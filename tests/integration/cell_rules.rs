@@ -1,6 +1,5 @@
-//! Tests the rules that compare each cell with its pack. Simulated packs with one fault run through the whole core, and
-//! the test checks the alarms of every cell. The diagnosis works on rows; a row holds the sums of each cell's samples
-//! over a few minutes.
+//! Tests the rules that compare each cell with its pack, on simulated packs with one fault. The diagnosis evaluates
+//! rows: sums of each cell's samples over a few minutes.
 
 use std::fmt::Write as _;
 
@@ -18,7 +17,7 @@ use packwatch::quantity::{CellIndex, Channel, Timestamp};
 use packwatch::sim::{Balancing, Scenario, SensorQuality, Sensors, Settings, Simulation, Wiring};
 
 const CELLS: u16 = 12;
-/// If no input arrives for longer than this (s), the vehicle counts as asleep.
+/// If no input arrives for this long (s), the vehicle counts as asleep.
 const SLEEP_GAP_S: f64 = 30.0;
 
 const PACK: &str = r#"
@@ -73,7 +72,6 @@ rule = "cell_imbalance"
 warning = "8 %"
 "#;
 
-/// Rules that judge a cell by its voltages.
 const OF_CELL: [Rule; 6] = [
     Rule::CapacityLow,
     Rule::UsableCapacityLow,
@@ -87,7 +85,6 @@ fn config() -> MonitorConfig {
     load(PACK, "Temperature")
 }
 
-/// Three temperature sensors with four cells each.
 fn config_with_three_sensors() -> MonitorConfig {
     let one = "[[input.temperature]]\nsignal = \"Pack.Temperature\"\n";
     let three = ["1-4", "5-8", "9-12"]
@@ -122,7 +119,6 @@ fn settings() -> Settings {
     settings
 }
 
-/// A simulated pack with a fault, the core that monitors it, and all events of the core.
 struct FaultyPack {
     sim: Simulation,
     encoder: InputEncoder,
@@ -155,7 +151,6 @@ impl FaultyPack {
         }
     }
 
-    /// A healthy pack with a balancing BMS.
     fn balanced(seed: u64, quality: SensorQuality) -> Self {
         let mut settings = settings();
         (settings.seed, settings.pack.spread.soc) = (seed, 0.005);
@@ -165,8 +160,7 @@ impl FaultyPack {
         pack
     }
 
-    /// Runs to the given day plus a quarter of an hour, so that the latest row ends and all inputs are back after
-    /// the night.
+    /// Runs to the given day plus a quarter of an hour. By then the latest row has ended, and all inputs are back.
     fn run_to(&mut self, day: f64) {
         let (mut out, mut frames) = (Outputs::default(), Vec::new());
         let mut moments_after = 0;
@@ -187,14 +181,12 @@ impl FaultyPack {
         }
     }
 
-    /// Stops the monitor for a second and restarts it with the stored state.
     fn restart(&mut self) {
         let stored = self.monitor.snapshot();
         self.monitor = Monitor::new(self.config.clone());
         self.monitor.restore(stored, Downtime::Seconds(1.0)).unwrap();
     }
 
-    /// Cells for which an alarm of the rule was raised, once per raise.
     fn raised(&self, rule: Rule) -> Vec<Option<u16>> {
         let raised = self.events.iter().filter_map(|event| match event.kind {
             EventKind::Alarm { rule: of, cell, change: Change::Raised, .. } if of == rule => {
@@ -239,7 +231,7 @@ fn loose_contact_raises_alarm_for_its_cell() {
     pack.run_to(4.0);
     assert_eq!(pack.raised(Rule::ConnectionResistance), [Some(2)]);
     assert_eq!(pack.raised(Rule::ChannelFaulty), []);
-    // At first, a loose contact of a cell may look like a loss of the cell's charge.
+    // A loose contact of a cell may first look like a loss of the cell's charge.
     assert!(pack.raised(Rule::CellLeak).iter().all(|cell| *cell == Some(2)));
     assert_ne!(pack.state(Rule::CellLeak, 2), AlarmState::Active);
     let contact = pack.value(Rule::ConnectionResistance, 2).unwrap();
@@ -291,7 +283,6 @@ fn faulty_channel_suppresses_alarm_until_new_pack() {
     );
 }
 
-/// Fault kinds found, with their first and last cells.
 fn found(pack: &FaultyPack) -> Vec<(CellFaultKind, Option<(CellIndex, CellIndex)>)> {
     pack.monitor.findings().iter().map(|finding| (finding.kind, finding.cells)).collect()
 }
@@ -319,8 +310,8 @@ fn leak_is_found_despite_balancing() {
     assert!(found(&pack).contains(&(CellFaultKind::Leak, Some((CellIndex(6), CellIndex(6))))), "{:?}", found(&pack));
 }
 
-/// Findings of 14 days in a pack of 12 cells whose BMS balances as in `Balancing::usual`, but with `bleed` times the
-/// bleed current. `configure` changes what the monitor knows about the balancing.
+/// Findings of 14 days in a pack whose BMS balances with `bleed` times the usual current. `configure` changes what the
+/// monitor is told about the balancing.
 fn found_in_balanced(
     fault: &str,
     bleed: f64,
@@ -343,12 +334,11 @@ fn found_in_balanced(
     found
 }
 
-/// Changes the meaning of the balancing bits.
 fn with_balancing(change: fn(BalancingConfig) -> BalancingConfig) -> impl Fn(MonitorConfig) -> MonitorConfig {
     move |config| MonitorConfig { balancing: config.balancing.map(change), ..config }
 }
 
-/// Without the bits, only the lowest cell (7) counts as leaking, because the BMS may have bled cell 3.
+/// Without the balancing bits, only the lowest cell (7) counts as leaking because the BMS may have bled cell 3.
 #[test]
 fn balancing_bits_reveal_leaks_of_other_cells() {
     let leak_of = |cell| (CellFaultKind::Leak, Some((CellIndex(cell), CellIndex(cell))));
@@ -358,7 +348,7 @@ fn balancing_bits_reveal_leaks_of_other_cells() {
     assert_eq!(found_in_balanced(faults, 1.0, without_bits), [leak_of(6)]);
 }
 
-/// While a cell's balancing bit is missing or unknown, the cell's loss may be due to bleeding.
+/// While a cell's balancing bit is missing or unknown, bleeding may explain the cell's loss.
 #[test]
 fn loss_explained_by_bleeding_raises_no_leak() {
     let unseen = with_balancing(|it| BalancingConfig { is_only_while_sent: false, max_age_s: 10.0, ..it });
@@ -372,8 +362,7 @@ fn loss_explained_by_bleeding_raises_no_leak() {
     assert_eq!(found_in_balanced("", 1.0, without_a_bit), []);
 }
 
-/// During the downtime no balancing bit is received, so a cell may have been bled. This holds even if the BMS bleeds
-/// only while it sends the bits.
+/// During a downtime the monitor receives no balancing bits, so a cell may have been bled.
 #[test]
 fn downtime_reduces_knowledge_of_leak() {
     let leak_std = |bleed_a: f64| {
@@ -385,7 +374,7 @@ fn downtime_reduces_knowledge_of_leak() {
         let mut pack = FaultyPack::simulated(config, settings(), Wiring::single(), "");
         pack.sim = pack.sim.with_balancing_bits();
         pack.run_to(0.01);
-        // The daemon stops during the first drive and starts again in the second drive, after the vehicle was parked.
+        // Stop the daemon during the first drive. Start it again in the second drive, after the vehicle was parked.
         let stored = pack.monitor.snapshot();
         while pack.sim.advance().unwrap().time < Timestamp::from_secs(9.0 * 3600.0) {}
         pack.monitor = Monitor::new(pack.config.clone());
@@ -410,7 +399,7 @@ fn frozen_current_is_found_once() {
     assert_eq!(pack.events.iter().filter(is_it).count(), 1);
 }
 
-/// With offsets of several kelvins, the median of three readings may be the reading of the detached sensor.
+/// If the offsets are several kelvins, the median of three readings may be the reading of the detached sensor.
 #[test]
 fn detached_temperature_sensor_is_found_despite_offsets() {
     let mut settings = settings();
@@ -429,7 +418,6 @@ fn detached_temperature_sensor_is_found_despite_offsets() {
 
 #[test]
 fn swapped_channels_are_found_and_keep_their_cells() {
-    // Swap cells that are far apart, and adjacent cells.
     for (fault, other) in [("weak:3:-12% swap:3:8@day3", 7), ("weak:3:-12% swap:3:4@day3", 3)] {
         let mut pack = FaultyPack::of(MonitorConfig { is_balanced: false, ..config() }, fault);
         pack.run_to(1.9);

@@ -10,7 +10,7 @@ fn packwatch() -> Command {
     command
 }
 
-/// Standard output of a run that must succeed with nothing on standard error.
+/// Standard output of a run that must succeed without standard error.
 fn good(args: &[&str]) -> String {
     let output = packwatch().args(args).output().unwrap();
     let text = |bytes: &[u8]| String::from_utf8(bytes.to_vec()).unwrap();
@@ -18,7 +18,7 @@ fn good(args: &[&str]) -> String {
     text(&output.stdout)
 }
 
-/// Exit code and lines on standard error of a run that must fail with nothing on standard output.
+/// Exit code and standard error of a check that must fail without standard output.
 fn bad(file: &Path) -> (i32, Vec<String>) {
     let output = packwatch().arg("check").arg(file).output().unwrap();
     assert!(output.stdout.is_empty());
@@ -26,7 +26,6 @@ fn bad(file: &Path) -> (i32, Vec<String>) {
     (output.status.code().unwrap(), lines)
 }
 
-/// The shipped `.toml` files of `config/` or one of its folders.
 fn shipped(folder: &str) -> Vec<PathBuf> {
     let entries = std::fs::read_dir(Path::new(env!("CARGO_MANIFEST_DIR")).join(folder)).unwrap();
     let mut files: Vec<PathBuf> = entries.map(|entry| entry.unwrap().path()).collect();
@@ -38,14 +37,14 @@ fn shipped(folder: &str) -> Vec<PathBuf> {
 
 #[test]
 fn every_shipped_configuration_is_valid() {
-    // The uplink's own tests check its settings.
+    // The uplink's tests check `uplink.toml`.
     for file in shipped("config").into_iter().filter(|file| !file.ends_with("uplink.toml")) {
         let printed = good(&["check", file.to_str().unwrap()]);
         assert!(printed.starts_with(&format!("{}: good\n", file.display())), "{printed}");
     }
 }
 
-/// The comment, the key and the alarm must state the same percentage; they once differed (30 % and 80 %).
+/// The file's comment, key and alarm must give the same percentage.
 #[test]
 fn measured_cell_end_of_life_is_consistent() {
     let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/measured.toml");

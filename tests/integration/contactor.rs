@@ -1,5 +1,5 @@
-//! If the contactors report open, the current counts as 0, even if the sensor reports another value. A contactor state
-//! that is no longer received counts as unknown.
+//! Tests contactor states. If the contactors report open, the current counts as 0, whatever the sensor reads. A
+//! contactor state that is not received counts as unknown.
 
 use packwatch::monitor::Downtime;
 use packwatch::quantity::catalogue::Quantity;
@@ -47,7 +47,7 @@ fn open_contactors_replace_missing_current() {
     rig.seconds(30);
     assert_eq!((current_a(&rig), rig.monitor.mode()), (Some(0.0), Mode::Rest));
     assert!(rig.monitor.lost_inputs().eq([Channel::Current]), "the input must still be reported missing");
-    // If the contactors are closed or unknown, the current is unknown.
+    // If the contactors are closed or their state is unknown, the current is unknown.
     rig.contactor = Some(1.0);
     rig.seconds(1);
     assert_eq!(current_a(&rig), None);
@@ -88,6 +88,6 @@ fn restart_with_open_contactors_is_deterministic() {
     };
     let (first, restarted) = (run(false), run(true));
     assert_eq!(first, run(false));
-    // Even a restart of 0 s is a downtime: the estimate may move within its tolerance.
+    // Even a restart of 0 s counts as a downtime, so the estimate may change within its tolerance.
     assert!((first.2 - restarted.2).abs() < 1e-3 && first.3 == restarted.3, "{} {}", first.2, restarted.2);
 }

@@ -1,5 +1,5 @@
-//! Tests the contract with other ECUs. A listener loses frames, starts late and sees the daemon killed. After two
-//! cycles the listener must have the daemon's alarm table. In one cycle the daemon sends each raised alarm four times.
+//! Tests the contract with other ECUs. A listener loses frames and starts late, and the daemon is killed. Two cycles
+//! later, the listener must have the daemon's alarm table. In one cycle the daemon sends each raised alarm four times.
 //! The listener is built only from the written DBC and the manual's page `ecu/contract.md`.
 //!
 //! `PACKWATCH_CONTRACT_RUNS` sets the number of runs (default 200); the full test has 10,000.
@@ -26,14 +26,12 @@ use crate::support::config_texts;
 const CELLS: u16 = 96;
 const PAGE_CELLS: u16 = 3;
 const PAGES: usize = (CELLS / PAGE_CELLS) as usize;
-/// Part of the frames that the listener loses.
+/// Fraction of the frames that the listener loses.
 const LOSS: f64 = 0.1;
-/// Restarts in a run.
 const RESTARTS: u32 = 10;
-/// Interval at which the test checks whether the daemon's alarm table has changed, ms.
+/// Interval between two comparisons of the alarm tables, ms.
 const STEP_MS: i64 = 100;
-/// Maximum wait until no alarm has changed for two cycles, ms. After the last random change, the share of bad readings
-/// still changes for up to a minute.
+/// Maximum wait for two cycles without an alarm change, ms. The share of bad readings changes for up to a minute.
 const MAX_WAIT_MS: i64 = 600_000;
 const BUS: BusIndex = BusIndex(0);
 
@@ -86,10 +84,10 @@ fn load() -> Config {
     config_texts::load(PACK, &dbc)
 }
 
-/// After this many digest periods without a digest, the table is no longer confirmed.
+/// If the listener receives no digest for this many digest periods, its table is not confirmed.
 const DIGEST_TIMEOUT_PERIODS: i64 = 3;
 
-/// A listener with the digest timeout: rule 5 of the contract.
+/// A listener that applies the digest timeout (rule 5 of the contract).
 struct TimedListener {
     listener: Listener,
     digest: CanId,
@@ -121,18 +119,16 @@ impl TimedListener {
     }
 }
 
-/// The daemon with its bus, its disk, and its simulated inputs.
 struct Daemon<'a> {
     config: &'a Config,
     random: ChaCha8Rng,
     monitor: Monitor,
-    /// State on disk. As in the service, it is stored after every alarm change. It is also stored after every command.
+    /// State on disk. It is stored after every alarm change, as in the service, and after every command.
     stored: Snapshot,
     encoder: InputEncoder,
     out: Outputs,
     now_ms: i64,
     listener: Option<TimedListener>,
-    /// Whether all digests to the listener are lost.
     is_digest_lost: bool,
     /// Per page of cells: 0 good, 1 missing, 2 out of range.
     pages: [u8; PAGES],
@@ -140,7 +136,6 @@ struct Daemon<'a> {
 }
 
 impl<'a> Daemon<'a> {
-    /// Creates a daemon with a listener attached from the start.
     fn with_listener(config: &'a Config, seed: u64) -> Self {
         let listener = TimedListener::new(config.output_layout.as_ref().unwrap());
         Self { listener: Some(listener), ..Self::new(config, seed) }
@@ -184,7 +179,7 @@ impl<'a> Daemon<'a> {
         self.out.clear();
     }
 
-    /// Advances the time. Sends input frames twice a second, and those ticks that are due.
+    /// Advances the time. Sends input frames twice a second, and the ticks that are due.
     fn run_for(&mut self, duration_ms: i64) {
         let end_ms = self.now_ms + duration_ms;
         while self.now_ms < end_ms {
@@ -242,7 +237,6 @@ impl<'a> Daemon<'a> {
         }
     }
 
-    /// Kills the process and restarts it from the stored state.
     fn restart(&mut self) {
         let away_ms = self.random.random_range(5..300) * 10;
         let age_ms = away_ms + self.now_ms - self.stored.time.nanos() / 1_000_000;
@@ -263,7 +257,6 @@ impl<'a> Daemon<'a> {
             .collect()
     }
 
-    /// Code of each rule in the digest.
     fn rules(&self) -> BTreeMap<u64, u64> {
         let code = |rule: Rule| match self.monitor.alarms().rule_summary(rule) {
             None => 5,
@@ -300,7 +293,7 @@ fn run(config: &Config, database: &Database, seed: u64) -> (usize, i64) {
         if now != state {
             (state, since_ms) = (now, daemon.now_ms);
         }
-        // The listener learns the cycle time from digests, so it may have changed since the last check.
+        // The listener learns the cycle time from digests, so the time may have changed since the last check.
         two_cycles_ms = 2 * daemon.listener.as_ref().unwrap().listener.cycle_ms();
         assert!(daemon.now_ms < began_ms + MAX_WAIT_MS, "seed {seed}: alarms never settle");
     }

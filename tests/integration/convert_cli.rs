@@ -1,4 +1,4 @@
-//! Runs `packwatch convert` as a user does: every format keeps the frames, and estimates become topics.
+//! Runs `packwatch convert` as a user does. Every format must keep the frames, and estimates must become topics.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -12,7 +12,6 @@ struct Bench {
 }
 
 impl Bench {
-    /// Simulates a short log.
     fn new() -> Self {
         let bench = Self { folder: tempfile::tempdir().unwrap() };
         bench.run(&["simulate", "-c", &bench.config(), "paper", "--out", "life.log", "--cycles", "1"]).success();
@@ -35,7 +34,6 @@ impl Bench {
         self.run(&["convert", from, to])
     }
 
-    /// Number of messages of each topic.
     fn topics(&self, name: &str) -> BTreeMap<String, usize> {
         let bytes = fs::read(self.path(name)).unwrap();
         let mut topics = BTreeMap::new();
@@ -51,7 +49,7 @@ impl Bench {
 #[test]
 fn frames_survive_each_format() {
     let bench = Bench::new();
-    // MF4 has numbers instead of names, so the interface gets a name with a number.
+    // MF4 stores interface numbers instead of names, so give the interface a name that contains a number.
     bench.run(&["convert", "--channel", "demo=can0", "life.log", "e.log"]).success();
     bench.convert("e.log", "a.mf4").success();
     bench.convert("a.mf4", "b.log.gz").success();

@@ -1,5 +1,5 @@
-//! Compares packwatch's decoding with `cantools`, an independent decoder, run by the interpreter that
-//! `PACKWATCH_PYTHON` names.
+//! Compares packwatch's decoding with `cantools`, an independent decoder. `PACKWATCH_PYTHON` names the Python
+//! interpreter.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::ffi::OsString;
@@ -14,7 +14,8 @@ use packwatch::quantity::Fault;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 
-/// Payloads per page of a message. A message without pages counts as one page.
+/// Payloads per page of a message. A page is one selection of the multiplexors; a message without multiplexors has one
+/// page.
 const PAYLOADS: usize = 1000;
 
 fn is_present(message: &Message, signal: usize, payload: &[u8]) -> bool {
@@ -24,8 +25,8 @@ fn is_present(message: &Message, signal: usize, payload: &[u8]) -> bool {
     })
 }
 
-/// Random payloads: `PAYLOADS` for each page of the message, with the page's selectors written. The other selectors get
-/// codes that some signal uses, because cantools rejects a payload with any other code.
+/// Random payloads: `PAYLOADS` for each page of the message, with the page's multiplexor values written. Each other
+/// multiplexor gets a value that some signal uses because cantools rejects a payload with any other value.
 fn payloads(message: &Message, random: &mut ChaCha8Rng) -> Vec<Vec<u8>> {
     let all: Vec<&MuxCondition> = message.signals.iter().flat_map(|signal| &signal.conditions).collect();
     let mut pages: Vec<&[MuxCondition]> = Vec::new();
@@ -61,15 +62,13 @@ fn payloads(message: &Message, random: &mut ChaCha8Rng) -> Vec<Vec<u8>> {
     made
 }
 
-/// Result of the comparison of a whole DBC.
 #[derive(Debug, Default)]
 struct Tally {
     payloads: usize,
     values: usize,
     /// Number of compared values per signal, by full name.
     per_signal: BTreeMap<String, usize>,
-    /// Number of payloads per signal that extends past the end of its message. All these payloads are too short for the
-    /// signal.
+    /// Number of payloads per signal that extends past the end of its message, so that every payload is too short.
     short: BTreeMap<String, usize>,
 }
 
@@ -93,7 +92,6 @@ fn compare(python: &OsString, path: &Path, strict: bool) -> Tally {
     let signals: usize = db.messages.iter().map(|message| message.signals.len()).sum();
     let counted = ask(python, path, &["count"], &[]);
     assert_eq!(counted, [format!("{} {signals}", db.messages.len())], "messages and signals");
-    // Every signal must be in one of the two maps.
     assert_eq!(tally.per_signal.len() + tally.short.len(), signals, "a signal was never present");
     for (name, count) in tally.per_signal.iter().chain(&tally.short) {
         assert!(*count >= PAYLOADS, "{name} was present only {count} times");

@@ -1,4 +1,4 @@
-//! Runs `packwatch diagnose` as a user does and compares the pack's lines with the simulator's truth.
+//! Runs `packwatch diagnose` as a user does and compares it with the simulator's truth.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -7,7 +7,7 @@ use std::process::Command;
 use assert_cmd::cargo::cargo_bin;
 use serde_json::Value;
 
-/// The leaking cell and the cell with a stuck channel, counted from 1, of 96 cells.
+/// The leaking cell and the cell with a stuck channel, counted from 1. The pack has 96 cells.
 const LEAKING: u64 = 7;
 const STUCK: u64 = 20;
 
@@ -17,8 +17,8 @@ fn packwatch(args: &[&str]) -> String {
     String::from_utf8(output.stdout).expect("text")
 }
 
-/// Computes three values from the last true state of every cell: the usable charge and the charge that balancing would
-/// recover (fractions of the mean cell's capacity), and the cell that ends a discharge.
+/// From the last true states: usable charge, charge that balancing would recover, and the cell that ends a discharge.
+/// Both charges are fractions of the mean cell's capacity.
 fn truth(path: &Path) -> (f64, f64, u64) {
     let mut cells: BTreeMap<u64, (f64, f64)> = BTreeMap::new();
     for row in csv::Reader::from_path(path).expect("the truth").deserialize() {
@@ -66,7 +66,7 @@ fn leak_cost_matches_simulator_and_names_cell() {
     assert_eq!((pack["discharge_limit"]["cell"].as_u64(), first_empty), (Some(LEAKING), LEAKING));
     assert_eq!((&pack["discharge_limit"]["reason"], &pack["unknown"]), (&Value::from("leak"), &Value::Null));
     assert_eq!(pack["left_out"], serde_json::json!([{ "cell": STUCK, "reason": "faulty_channel" }]));
-    // The stored state contains no cell model from a file, so the energy is unknown.
+    // The stored state does not contain a cell model from a file, so the energy is unknown.
     assert_eq!(pack["usable"]["kwh"], Value::Null);
 
     let lines = packwatch(&["diagnose", "--state", &state]);

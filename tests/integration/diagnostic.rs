@@ -1,5 +1,4 @@
-//! Tests cells that are read by diagnostic requests, end to end: a simulated pack is replayed and its cells are
-//! estimated. Also reads the log of a real car whose controllers were polled.
+//! Tests cells that are read by diagnostic requests, on a simulated pack and on the log of a real car.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -97,8 +96,8 @@ fn leaf_log_gives_values_of_its_answers() {
     assert!(controller["lost"].as_array().unwrap().iter().all(|lost| lost == 0), "{controller}");
 }
 
-/// The current rises while the answer with the cells is transmitted. The cell voltages belong to the current at the
-/// time of the answer's first frame.
+/// The current rises during the answer with the cells. The cells' voltages belong to the current at the answer's first
+/// frame.
 #[test]
 fn answer_values_are_dated_to_first_frame() {
     let folder = tempfile::tempdir().unwrap();
@@ -129,8 +128,8 @@ fn answer_values_are_dated_to_first_frame() {
     assert_eq!(measured, [(Timestamp::from_nanos(100_000_000), 10.0); 8]);
 }
 
-/// Reproduces a fault of a public car definition: the pack voltage lacks a division by ten. The definition also limits
-/// the voltage to the range that its author expected.
+/// Reproduces two faults of a public car definition. The pack voltage lacks a division by ten, and it is limited to the
+/// range that the author expected.
 #[test]
 fn doctor_finds_pack_voltage_off_by_ten() {
     let folder = tempfile::tempdir().unwrap();
@@ -140,7 +139,7 @@ fn doctor_finds_pack_voltage_off_by_ten() {
     );
     let config = written(folder.path(), &pack);
     let mut group_1 = [&[0x61, 1][..], &[0; 51]].concat();
-    group_1[20..22].copy_from_slice(&35_520_u16.to_be_bytes()); // 355.20 V, of 96 cells of 3.7 V
+    group_1[20..22].copy_from_slice(&35_520_u16.to_be_bytes()); // 355.20 V from 96 cells of 3.7 V
     let group_2 = [&[0x61, 2][..], &3700_u16.to_be_bytes().repeat(96)].concat();
     let mut log = String::new();
     let mut ms = 0;

@@ -1,6 +1,5 @@
-//! Tests `packwatch discover` on logs of real cars, and on simulated traffic among messages of random content. Pack
-//! voltage, current, cells and temperature must be among the first three candidates, and `--write` must write a valid
-//! configuration.
+//! Tests `packwatch discover` on logs of real cars, and on simulated traffic mixed with random messages. Pack voltage,
+//! current, cells and temperature must be among the first three candidates.
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -23,14 +22,12 @@ fn packwatch(args: &[&str]) -> assert_cmd::assert::Assert {
     assert_cmd::Command::cargo_bin("packwatch").unwrap().args(args).assert()
 }
 
-/// Signals of one quantity in a discovery, best first.
 fn found(document: &Value, quantity: &str) -> Vec<String> {
     let candidates = document["discovery"]["candidates"].as_array().unwrap().iter();
     let of_quantity = candidates.filter(|candidate| candidate["quantity"] == quantity);
     of_quantity.map(|candidate| candidate["signal"].as_str().unwrap().to_owned()).collect()
 }
 
-/// A log, its options, and the expected signal of each quantity.
 struct Trial<'a> {
     name: &'a str,
     log: PathBuf,
@@ -69,7 +66,7 @@ fn simulate(folder: &Path, name: &str, dbc: &Path, inputs: &str, cells: u32) -> 
     log
 }
 
-/// Adds all remaining messages of the DBC, twice a second, with random bytes.
+/// Adds all other messages of the DBC, twice a second, with random bytes.
 fn add_other_messages(log: &Path, dbc: &Path) {
     let text = std::fs::read_to_string(log).unwrap();
     let stamp = |line: &str| line[1..line.find(')').unwrap()].parse::<f64>().unwrap();
@@ -98,7 +95,7 @@ fn add_other_messages(log: &Path, dbc: &Path) {
     std::fs::write(log, all).unwrap();
 }
 
-/// Writes the raw frames of a car's test cases as a log. Each request is followed by its answer.
+/// Writes the raw frames of a car's test cases as a log, each request followed by its answer.
 fn log_of_cases(folder: &Path, car: &str, year: &str, identifiers: &[&str], log: &Path) {
     let mut streams: Vec<Vec<Case>> = Vec::new();
     for identifier in identifiers {
@@ -149,7 +146,7 @@ const TESLA_OF_CELLS: &[(&str, &str)] = &[
     ("cell_voltage", "ID401CellVoltages.Cell{n}"),
     ("temperature", "ID332BattCellMinMax.BattCellTempMax332"),
 ];
-/// Without a DBC, messages are named by their number.
+/// Without a DBC, the name of a message contains its number.
 const KONA_FIELDS: &[(&str, &str)] = &[
     ("current", "Message1429.Current_16bits_at_32_little"),
     ("pack_voltage", "Message1429.Voltage_16bits_at_48_little"),

@@ -1,6 +1,6 @@
-//! Compares packwatch's end-to-end protection with two independent implementations, PyPI `autosar-e2e` (profiles 1A, 1C
-//! and 5) and `cantools` (profile 5), run by the interpreter that `PACKWATCH_PYTHON` names. packwatch and the peer must
-//! accept each other's payloads, produce equal bytes, and reject a payload with one wrong bit.
+//! Compares packwatch's end-to-end protection with two independent implementations: PyPI `autosar-e2e` (profiles 1A, 1C
+//! and 5) and `cantools` (profile 5). packwatch and the peer must accept each other's payloads, produce equal bytes,
+//! and reject a payload with one wrong bit. `PACKWATCH_PYTHON` names the Python interpreter.
 
 use std::ffi::OsString;
 use std::io::Write;
@@ -14,7 +14,7 @@ use rand_chacha::rand_core::{Rng, SeedableRng};
 /// Payloads per profile.
 const PAYLOADS: usize = 100_000;
 
-/// The interpreter that `PACKWATCH_PYTHON` names. If the variable is not set, prints a note and returns `None`.
+/// The value of `PACKWATCH_PYTHON`. If the variable is not set, prints a note and returns `None`.
 fn python() -> Option<OsString> {
     let python = std::env::var_os("PACKWATCH_PYTHON");
     if python.is_none() {
@@ -23,7 +23,6 @@ fn python() -> Option<OsString> {
     python
 }
 
-/// Sends the lines to the oracle and returns its answers.
 fn ask(python: &OsString, lines: &[String]) -> Vec<String> {
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/tools/e2e_oracle.py");
     let mut child = Command::new(python).arg(script).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
@@ -43,10 +42,8 @@ fn bytes(hex: &str) -> Vec<u8> {
     (0..hex.len() / 2).map(|n| u8::from_str_radix(&hex[2 * n..2 * n + 2], 16).unwrap()).collect()
 }
 
-/// One payload, protected by both sides.
 struct Case {
     protection: Protection,
-    /// packwatch's next counter.
     counter: u8,
     /// Payload before protection, with the previous counter value.
     raw: Vec<u8>,
@@ -82,8 +79,7 @@ impl Case {
         format!("{} {data_id} {} {} {}", profile.name(), hex(&self.raw), hex(&self.ours), hex(&self.flipped))
     }
 
-    /// Checks one peer's answer: the peer's payload, whether the peer accepts packwatch's payload, and whether it
-    /// rejects the payload with a wrong bit.
+    /// Checks a peer's payload, and whether the peer accepts packwatch's payload and rejects the flipped one.
     fn compare(&self, peer: &str, answer: &[&str]) {
         let what = self.question();
         let [theirs, accepts, accepts_flipped] = answer else { panic!("{peer} answers {answer:?} to {what}") };

@@ -1,4 +1,4 @@
-//! Runs the examples: the log with its DBC and configuration, both listening ECUs, and the core as a library.
+//! Tests the examples: the log with its DBC and configuration, both listening ECUs, and the core as a library.
 
 use std::fs;
 use std::io::BufReader;
@@ -13,10 +13,9 @@ mod core_as_library;
 #[path = "../../examples/listen.rs"]
 mod listen;
 
-/// Output of a listener for the frames of the example's log.
 const HEARD: &str = "1700000000.1 status valid, SOC 27.8 %\n\
                      1700000175.1 alarm SocLow warning pack active: 20, threshold 20\n";
-/// Maximum size of the example's files, bytes, so that a clone stays small.
+/// Maximum total size of the example's files, so that a clone stays small.
 const MOST_BYTES: u64 = 50_000;
 
 fn repository() -> &'static Path {

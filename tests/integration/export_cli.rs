@@ -15,7 +15,6 @@ struct Bench {
 }
 
 impl Bench {
-    /// Simulates a life of three cycles.
     fn new() -> Self {
         Self::of_cycles("3")
     }
@@ -36,7 +35,6 @@ impl Bench {
         command.current_dir(self.folder.path()).args(args).arg("--config").arg(config).assert()
     }
 
-    /// Rows as maps from column name to value.
     fn csv(&self, name: &str) -> Vec<BTreeMap<String, String>> {
         let mut reader = csv::Reader::from_path(self.path(name)).unwrap();
         reader.deserialize().map(Result::unwrap).collect()
@@ -201,7 +199,7 @@ fn columns_page_matches_repository() {
     );
 }
 
-/// Compares with Python's readers, if installed.
+/// Compares the tables with the output of Python's readers, if these are installed.
 #[test]
 fn python_readers_agree_with_export() {
     let bench = Bench::new();

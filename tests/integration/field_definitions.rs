@@ -1,5 +1,5 @@
-//! Tests `check`, `replay` and `doctor` on definitions from the field: a DBC with a faulty message, a current whose
-//! direction is in another signal, and J1939 messages from another source address.
+//! Tests `check`, `replay` and `doctor` on definitions from practice: a DBC with a faulty message, a current whose
+//! direction is in another signal, and J1939 messages from an unexpected source address.
 
 use std::path::{Path, PathBuf};
 
@@ -9,7 +9,7 @@ fn folder(case: &str) -> PathBuf {
     measured::path("../more-data/field").join(case)
 }
 
-/// A copy of a case's configuration with other texts, in a folder of its own.
+/// A copy of a case's configuration in a folder of its own, with some text replaced.
 struct Case {
     place: tempfile::TempDir,
     log: PathBuf,
@@ -33,7 +33,6 @@ impl Case {
         self.place.path().join("pack.toml")
     }
 
-    /// Standard output of a command, which must succeed.
     fn run(&self, args: &[&Path]) -> String {
         let done = assert_cmd::Command::cargo_bin("packwatch").unwrap().args(args).assert().success();
         String::from_utf8(done.get_output().stdout.clone()).unwrap()
@@ -85,7 +84,7 @@ fn sign_in_other_signal_gives_signed_current() {
     assert!(by_flag.iter().any(|a| *a < -0.5) && by_flag.iter().any(|a| *a > 0.5));
     assert_eq!(by_flag.len(), by_bit.len());
     let apart = by_flag.iter().zip(&by_bit).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
-    // The flag's log has a resolution of 0.1 A for 20 strings, the other 0.01 A.
+    // The current of 20 strings has a resolution of 0.1 A in the log with the flag, and 0.01 A in the other log.
     assert!(apart < 0.06, "{apart}");
     for of in [flag, bit] {
         let page = of.doctor();

@@ -27,7 +27,7 @@ fn pulses(folder: &Path, rows: u32, first_v: f64) -> PathBuf {
     path
 }
 
-/// Standard error of a run that must fail with code 1 and write no model.
+/// Standard error of a fit that must fail with code 1 and write no model.
 fn refused(folder: &Path, args: &[&str]) -> String {
     let model = folder.join("model.toml");
     let output = packwatch().arg("fit").args(["--name", "cell", "-o"]).arg(&model).args(args).output().unwrap();

@@ -1,5 +1,5 @@
-//! Tests cell models that come from a label (`score --chemistry`) or are fitted to ordinary drives (`fit --log`), on
-//! simulated and measured cells.
+//! Tests cell models from a label (`score --chemistry`) and from ordinary drives (`fit --log`), on simulated and
+//! measured cells.
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -28,8 +28,7 @@ fn json(args: &[&str]) -> Value {
     serde_json::from_str(&out).unwrap()
 }
 
-/// The true cell: the label's chemistry, but with an open-circuit curve that is 15 mV higher in the middle and another
-/// capacity. `drive` also scales its resistances.
+/// The true cell. Its open-circuit curve is 15 mV above the label's chemistry in the middle, and its capacity differs.
 fn true_model() -> CellModel {
     let mut model = Label::usual(Chemistry::NcaGraphite, TRUE_AH).model().unwrap();
     let soc = model.soc.clone();
@@ -72,8 +71,7 @@ fn drive(folder: &Path, name: &str, mut soc: f64, seed: u32) -> PathBuf {
     path
 }
 
-/// Root mean square error of the SOC in points, and fraction of the samples inside the interval, from the first score
-/// of a run.
+/// Root mean square SOC error in points, and fraction of samples inside the interval, from the first score.
 fn soc_score(args: &[&str]) -> (f64, f64) {
     let found = json(args);
     let soc = &found["scores"][0]["soc"];
@@ -144,8 +142,7 @@ fn two_drives_identify_measured_cell() {
     let model = model.to_str().unwrap();
     let label = ["--chemistry", "nca-graphite", "--rated", "2.9"];
     let truth = ["score", "--json", "--truth-capacity", "2.99", &c];
-    // tests/label.md lists all cells. This cell: SOC RMSE 2.9 points with the label's model, 0.5 points after the fit
-    // to two drives.
+    // This cell in tests/label.md: 2.9 points with the label's model, 0.5 points after the fit to two drives.
     let (label_rmse, label_inside) = soc_score(&[&truth[..], &label].concat());
     assert!(label_rmse < 4.0 && label_inside > 0.85, "{label_rmse} {label_inside}");
     json(&[&["fit", "--json", "--log", &a, &b, "-o", model][..], &label].concat());

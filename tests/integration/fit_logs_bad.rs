@@ -1,5 +1,5 @@
-//! Tests `fit --log` with bad logs: the fitted model must be at least as good as the label's, and the output must
-//! name what is missing.
+//! Tests `fit --log` with bad logs. The model must be at least as good as the label's. The output must name what the
+//! log lacks.
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -13,7 +13,6 @@ use serde_json::Value;
 const TRUE_AH: f64 = 50.0;
 const RESISTANCE: f64 = 1.3;
 
-/// Properties of a generated log.
 #[derive(Clone, Copy)]
 struct Drive {
     chemistry: Chemistry,
@@ -45,7 +44,7 @@ const DRIVE: Drive = Drive {
 };
 
 impl Drive {
-    /// The true cell: as its label says, but with an open-circuit curve that is 15 mV higher in the middle.
+    /// The true cell: its open-circuit curve is 15 mV above the label's chemistry in the middle.
     fn model(&self) -> CellModel {
         let mut model = Label::usual(self.chemistry, self.capacity_ah).model().unwrap();
         let soc = model.soc.clone();
@@ -56,8 +55,8 @@ impl Drive {
     }
 
     /// Current at the given second (A). Repeats 20 s at 1C, 20 s at C/3 and 20 s of rest, with longer rests of 10 min.
-    /// If `has_rests` is false, the current is C/5 instead of the short rests, and the longer rests are left out. A
-    /// charge has half of these currents.
+    /// If `has_rests` is false, C/5 replaces the short rests, and the longer rests are left out. A charge has half of
+    /// these currents.
     fn current_a(&self, second: u32) -> f64 {
         let discharge_a = match second % 60 {
             _ if self.has_rests && second % 3000 > 2400 => 0.0,
@@ -97,7 +96,6 @@ impl Drive {
     }
 }
 
-/// Writes a file of several consecutive drives.
 fn log(folder: &Path, name: &str, drives: &[Drive]) -> PathBuf {
     let mut text = "time_s,current_a,voltage_v,temperature_c,discharged_ah\n".to_owned();
     let mut second = 0;
@@ -115,14 +113,14 @@ fn json(args: &[&str]) -> Value {
     serde_json::from_slice(&output.stdout).unwrap()
 }
 
-/// Root mean square error in points and fraction within the interval, for a drive that the fit has not used.
+/// Root mean square SOC error in points, and fraction of samples within the interval.
 fn score(args: &[&str]) -> (f64, f64) {
     let found = json(&[&["score", "--json", "--truth-capacity", "50"][..], args].concat());
     let soc = &found["scores"][0]["soc"];
     (soc["rmse_points"].as_f64().unwrap(), soc["coverage"].as_f64().unwrap())
 }
 
-/// Notes of a fit to `logs`. Checks that the model is at least as good as the label on another drive.
+/// Notes of a fit to `logs`. Checks that the model is at least as good as the label's on another drive.
 fn notes_of_fit(folder: &Path, logs: &[PathBuf], label: &[&str]) -> Vec<String> {
     let model = folder.join("model.toml");
     let (model, judge) = (model.to_str().unwrap(), log(folder, "judge.csv", &[DRIVE]));
@@ -207,8 +205,7 @@ fn wrong_label_chemistry_is_named() {
 #[test]
 fn current_offset_over_days_keeps_chemistry() {
     let folder = tempfile::tempdir().unwrap();
-    // The current sensor is off by C/50 for more than two days, so the counted charge is wrong by more than the
-    // capacity.
+    // The sensor is off by C/50 for more than two days, so the counted charge is wrong by more than the capacity.
     let drive = Drive { offset_a: TRUE_AH / 50.0, every_s: 10, ..DRIVE };
     let (out, back) = (Drive { soc: (0.9, 0.2), ..drive }, Drive { soc: (0.2, 0.9), ..drive });
     let logs = [log(folder.path(), "a.csv", &[out, back].repeat(10))];

@@ -1,5 +1,5 @@
-//! Runs `packwatch fleet` as a user does. The output is byte-identical, however the fleet is divided into parts.
-//! Neither a kill nor a damaged log loses data.
+//! Runs `packwatch fleet` as a user does. The output must not depend on the division into parts. A kill or a damaged
+//! log must not lose data.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -55,7 +55,8 @@ impl Fleet {
         command
     }
 
-    /// Replays a part of the fleet and returns the command's output. The exit code must be 1 if a vehicle failed.
+    /// Replays a part of the fleet and returns the command's output. The exit code must be 1 exactly if a vehicle
+    /// failed.
     fn run(&self, out: &str, more: &[&str]) -> String {
         let mut command = self.command(&["fleet", "run", "fleet.jsonl", "--estimates", "60", "-o", out, "-c"]);
         let ran = command.arg(config()).args(more).output().unwrap();
@@ -67,7 +68,6 @@ impl Fleet {
         printed
     }
 
-    /// The bytes of the merged tables.
     fn merged(&self, folders: &[&str], out: &str) -> Vec<Vec<u8>> {
         let mut command = self.command(&["fleet", "merge", "--manifest", "fleet.jsonl", "-o", out]);
         command.args(folders).assert().success();
@@ -115,7 +115,7 @@ fn merged_tables_are_independent_of_parts() {
     let stated: i64 = rows.iter().map(|row| i64::from(row.get_int(5).unwrap())).sum();
     assert_eq!(half_cycles.metadata().file_metadata().num_rows(), stated);
 
-    // The three files of the folder make up one life.
+    // The three files of the folder form one life.
     let mut command = fleet.command(&["export", "--period", "60", "--out", "alone", "logs/six/whole", "-c"]);
     command.arg(config()).assert().success();
     let rows_of = |path: &str| {
@@ -164,12 +164,12 @@ fn killed_run_continues_and_keeps_complete_vehicles() {
     let count = |word: &str| outcomes.iter().filter(|vehicle| vehicle["outcome"] == word).count();
     let kept: usize =
         printed.split(" already complete").next().and_then(|text| text.rsplit(' ').next()?.parse().ok()).unwrap();
-    // One of the vehicles that were complete before may be the one with the broken log, which is replayed again.
+    // The count may include the vehicle with the broken log, which is replayed again.
     assert!((before - 1..=before).contains(&kept) && kept > 0, "{before} were complete: {printed}");
     assert_eq!((count("complete"), count("failed")), (6, 1), "a failed vehicle is replayed again");
     assert!(wanted == fleet.merged(&["killed"], "continued"));
 
-    // Replay again after a change of a reading option or of the logs.
+    // A changed reading option or a changed log requires a new replay.
     assert!(fleet.run("killed", &["--sleep-gap", "1000"]).contains("6 vehicles replayed, 0 already complete"));
     fs::write(
         fleet.path("fleet.jsonl"),
@@ -251,7 +251,7 @@ fn vehicle_specific_configuration_is_used() {
     assert!(fleet.run("out", &[]).contains("1 vehicles replayed, 5 already complete, 1 failed"));
 }
 
-/// A model that a vehicle could have learned: the label's curve with another capacity.
+/// A model as a vehicle could learn it: the label's curve with another capacity.
 fn learned(label: &Label, capacity_ah: f64) -> LearnedModel {
     let prior = label.prior().unwrap();
     let (modes_v, rest_v) = prior.curve.modes_v();
@@ -281,7 +281,7 @@ fn prior_of_fleet_is_reproducible_and_configures_vehicle() {
     let models = [2.3, 2.4, 2.5, 2.4].map(|capacity_ah| learned(&nmc, capacity_ah));
     write("none", &[]);
     write("two", &models[..2]);
-    // A vehicle that started from a prior does not count: its model repeats the prior.
+    // A vehicle that started from a prior does not count because its model repeats the prior.
     let repeated = LearnedModel { has_prior: true, ..learned(&nmc, 2.5) };
     write("tables", &[&models[..], &[learned(&nca, 2.8), repeated]].concat());
     for (args, wanted) in [
@@ -305,7 +305,7 @@ fn prior_of_fleet_is_reproducible_and_configures_vehicle() {
     let text = fs::read_to_string(fleet.path("one.toml")).unwrap();
     assert!(text == fs::read_to_string(fleet.path("two.toml")).unwrap(), "the same fleet gives the same bytes");
 
-    // A vehicle starts from the file; a file for another label or a damaged file is refused.
+    // A vehicle can start from the file. A file for another label or a damaged file is rejected.
     let configure = |rated_ah: f64, prior: &str| {
         let cell = format!("chemistry = \"nmc811-graphite\"\nrated_capacity_ah = {rated_ah}\nprior = \"{prior}\"");
         let demo = fs::read_to_string(config()).unwrap();

@@ -1,5 +1,4 @@
-//! Runs inputs through the fuzz entry points (`fuzz/src/doors`), with the stable compiler and without a fuzzer. The
-//! inputs are the files in `fuzz/seeds` (seeds, and inputs that once broke an invariant) and mutated copies of them.
+//! Runs `fuzz/seeds` and mutated copies of it through the fuzz entry points (`fuzz/src/doors`), without a fuzzer.
 //! `PACKWATCH_FUZZ_CHANGES` sets the number of copies per entry point.
 
 use std::path::Path;
@@ -10,8 +9,7 @@ use self::doors::DOORS;
 #[expect(unreachable_pub, dead_code, reason = "the fuzz targets look up an entry point by name")]
 mod doors;
 
-/// Number of mutated copies per entry point; the entry point `store` gets a tenth. `tests/fuzz` runs the fuzzers
-/// themselves.
+/// Number of mutated copies per entry point; the entry point `store` gets a tenth.
 const CHANGES: usize = 200;
 
 /// A pseudo-random stream (xorshift64*).
@@ -56,7 +54,6 @@ fn seeds(door: &str) -> Vec<Vec<u8>> {
     paths.iter().map(|path| std::fs::read(path).unwrap()).collect()
 }
 
-/// Maximum number of failing inputs printed per entry point.
 const SHOWN: usize = 3;
 
 #[test]

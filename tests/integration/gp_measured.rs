@@ -1,6 +1,7 @@
-//! Repeats the paper's Gaussian process regression on the paper's data: the voltage of cell RW9 as a function of time,
-//! temperature and current. The kernel is exponential, the basis constant, and the inputs are standardised. One of five
-//! folds is held out. The paper states an RMSE of 0.1058 V over five folds.
+//! Repeats the Gaussian process regression of "Battery Predictions for Electronic Prognostics" on the paper's data: the
+//! voltage of cell RW9 as a function of time, temperature and current. The kernel is exponential, the basis constant,
+//! and the inputs are standardised. One of five folds is held out. The paper reports an RMSE of 0.1058 V over five
+//! folds.
 
 use std::ops::ControlFlow;
 use std::path::Path;

@@ -1,6 +1,6 @@
-//! Compares packwatch's exact Gaussian process with scikit-learn's, run by the interpreter that `PACKWATCH_PYTHON`
-//! names. With the same rows and hyperparameters, means and standard deviations agree to 1e-8. `tests/peers/run --only
-//! gp` also compares the fit times, alternating in one run with the same number of threads.
+//! Compares packwatch's exact Gaussian process with scikit-learn's (interpreter `PACKWATCH_PYTHON`). With the same rows
+//! and hyperparameters, means and standard deviations must agree to 1e-8. `tests/peers/run --only gp` also compares the
+//! fit times.
 
 use std::io::{BufRead, BufReader, Write};
 use std::ops::ControlFlow;
@@ -10,7 +10,7 @@ use std::time::Instant;
 
 use packwatch::regress::{Basis, Form, GprSettings, Model, TrainingRows, fit};
 
-/// Number of rows, maximum fit time relative to scikit-learn's, and repetitions.
+/// Number of rows, maximum fit time relative to scikit-learn's, and number of repetitions.
 const BARS: [(usize, f64, usize); 2] = [(2000, 0.8, 7), (5000, 0.6, 3)];
 
 struct Oracle {
@@ -20,7 +20,7 @@ struct Oracle {
 }
 
 impl Oracle {
-    /// Starts the oracle. Prints a note and returns `None` without Python or without scikit-learn.
+    /// Starts the Python process. If Python or scikit-learn is missing, prints a note and returns `None`.
     fn start(threads: usize) -> Option<Self> {
         let Some(python) = std::env::var_os("PACKWATCH_PYTHON") else {
             eprintln!("SKIPPED: PACKWATCH_PYTHON is not set to a Python with scikit-learn");
@@ -46,7 +46,7 @@ impl Oracle {
 
     fn ask(&mut self, line: &str) -> String {
         let mut answer = String::new();
-        // Ignore write errors: if the oracle has exited, its missing answer shows that.
+        // Ignore write errors: if the process has exited, its answer is missing and the caller fails.
         let _ = writeln!(self.stdin, "{line}");
         self.stdout.read_line(&mut answer).unwrap();
         answer.trim().to_owned()
@@ -86,7 +86,7 @@ fn case(oracle: &mut Oracle, rows: usize, folder: &Path) -> Case {
     }
 }
 
-/// Uses the oracle's hyperparameters: length scale 1.5, signal 1, noise variance 0.01, no mean.
+/// Fits packwatch's model with the oracle's hyperparameters: length scale 1.5, signal 1, noise variance 0.01, no mean.
 fn ours(case: &Case, threads: usize) -> Model {
     let mut settings = GprSettings::new("exponential".parse().unwrap(), case.targets.len());
     (settings.basis, settings.form, settings.threads) = (Basis::Zero, Form::Exact, threads);

@@ -31,7 +31,6 @@ fn refused(folder: &Path, code: i32, args: &[&str]) -> String {
     String::from_utf8(output.stderr).unwrap()
 }
 
-/// Reproducible normal numbers.
 fn noise(mut state: u64) -> impl FnMut() -> f64 {
     move || {
         // The sum of twelve uniform numbers is approximately normal.
@@ -76,13 +75,13 @@ fn cross_validation_reports_every_kernel() {
     assert_eq!(names, ["exponential", "squared_exponential", "exponential + matern52"]);
     for kernel in kernels {
         let number = |name: &str| kernel[name].as_f64().unwrap();
-        // 20 mV of noise cannot be predicted. Predicting the mean alone would leave an error of 280 mV.
+        // The 20 mV of noise cannot be predicted. A constant prediction (the mean) would have an error of 280 mV.
         assert!((0.019..0.06).contains(&number("rmse")), "{kernel}");
         assert!(number("mean_absolute_error") < number("rmse") && number("training_s") > 0.0, "{kernel}");
         assert!((0.89..=0.995).contains(&number("coverage_95")), "{kernel}");
         assert!(number("peak_memory_kib") > 1000.0 && kernel["folds"].as_array().unwrap().len() == 3, "{kernel}");
     }
-    // The score must equal the score that the test calculates from the written rows.
+    // The printed score must equal the score computed from the written rows.
     let text = std::fs::read_to_string(place.join("all.csv")).unwrap();
     assert_eq!(
         text.lines().next().unwrap(),
@@ -101,7 +100,6 @@ fn cross_validation_reports_every_kernel() {
     assert_eq!(text.lines().count(), 1 + 3 * 240);
     let rmse = (squares.iter().sum::<f64>() / 240.0).sqrt();
     assert!((rmse - kernels[0]["rmse"].as_f64().unwrap()).abs() < 1e-12);
-    // Text output: a line per kernel, the chosen form, and pictures.
     let shown = printed(
         place,
         &[&["cv", file, "--kernel", "matern32", "--folds", "2", "--plots", "plots"], &COLUMNS[..]].concat(),
@@ -112,7 +110,6 @@ fn cross_validation_reports_every_kernel() {
     assert!(picture.contains("predicted against measured") && picture.contains("95 % interval"));
 }
 
-/// Bit patterns of the means in a file of predictions.
 fn means(text: &str) -> Vec<u64> {
     let mean = |line: &str| line.split(',').nth(6).unwrap().parse::<f64>().unwrap().to_bits();
     text.lines().skip(1).map(mean).collect()
@@ -155,12 +152,12 @@ fn saved_model_predicts_bit_identically() {
         assert!(found["score"]["rmse"].as_f64().unwrap() < 0.08, "{form}: {found}");
         assert!(found["score"]["coverage_95"].as_f64().unwrap() > 0.85, "{form}: {found}");
         let written = std::fs::read_to_string(place.join("out.csv")).unwrap();
-        // Predict again from the saved model with one thread; standard output must carry the same rows.
+        // Predict again from the saved model with one thread.
         let again = printed(place, &["predict", "model.json", "later.csv", "--threads", "1"]);
         assert!(again == written, "{form}: other predictions");
         assert_eq!(means_of_a_model_never_saved(place, form), means(&written), "{form}");
     }
-    // Without the output column there is no score, but the rows are still predicted.
+    // Without the output column there is no score, but the rows must still be predicted.
     std::fs::write(place.join("new.csv"), "current_a,temperature_c,time_s\n1,25,10\n0,30,20\n").unwrap();
     let found = json(place, &["predict", "model.json", "new.csv", "-o", "out.csv"]);
     assert_eq!((&found["rows"], &found["known"], &found["score"]), (&2.into(), &0.into(), &Value::Null));
@@ -199,7 +196,6 @@ fn bad_input_error_names_place_and_range() {
     let found = json(place, &some);
     assert_eq!((&found["rows"], &found["skipped"]), (&38.into(), &2.into()));
     assert!(printed(place, &some).contains("2 rows left out: a value is missing"));
-    // Test too few rows, an unknown kernel, a file that is not a model, and a damaged model.
     std::fs::write(place.join("few.csv"), text.lines().take(4).collect::<Vec<_>>().join("\n")).unwrap();
     let few = refused(place, 1, &[&["cv", "few.csv"], &COLUMNS[..]].concat());
     assert!(few.contains("folds = 5, must be"), "{few}");
@@ -219,8 +215,8 @@ fn bad_input_error_names_place_and_range() {
     assert!(steps.contains("windows of 5 lags and"), "{steps}");
 }
 
-/// Two series: the voltage is autoregressive, x(t) = 1.6 x(t-1) - 0.64 x(t-2) + e, and drives the temperature. The rows
-/// come in parts of 400.
+/// Writes two series in parts of 400 rows. The voltage is autoregressive, x(t) = 1.6 x(t-1) - 0.64 x(t-2) + e, and
+/// drives the temperature.
 fn process(folder: &Path) {
     let mut draw = noise(11);
     let mut text = "cycle,time_s,voltage_v,temperature_c\n".to_owned();
@@ -229,7 +225,7 @@ fn process(folder: &Path) {
         for k in 0..450 {
             x = [1.6 * x[0] - 0.64 * x[1] + 0.01 * draw(), x[0]];
             y += 0.1 * (25.0 + 20.0 * x[0] - y) + 0.05 * draw();
-            // Skip the beginning of each part, which still depends on its start.
+            // Skip the beginning of each part because it still depends on the initial values.
             if k >= 50 {
                 writeln!(text, "{cycle},{},{:.5},{:.4}", 10 * (k - 50), 3.7 + x[0], y).unwrap();
             }
@@ -263,7 +259,7 @@ fn forecast_interval_holds_and_error_grows() {
         let persistence = of("persistence_rmse");
         assert!(rmse.iter().zip(&persistence).all(|(ours, naive)| ours < naive), "{rmse:?} against {persistence:?}");
     }
-    // One step ahead, the process noise of 10 mV remains.
+    // The error one step ahead is the process noise of 10 mV.
     let first = found["outputs"][0]["horizons"][0]["score"]["rmse"].as_f64().unwrap();
     assert!((0.0092..0.0115).contains(&first), "{first}");
     let text = std::fs::read_to_string(place.join("all.csv")).unwrap();

@@ -1,9 +1,8 @@
-//! Tests `packwatch import obdb` on the signal sets of three cars. The core reads every expected value of their test
-//! cases from raw frames through the imported file: ISO-TP, configuration, decoder.
+//! Tests `packwatch import obdb` on the signal sets of three cars. The core must read every expected value of their
+//! test cases from raw frames through the imported file.
 //!
-//! The reference decoder clamps a value to its range; packwatch reports such a value as out of range. No other
-//! difference is allowed. Some cases were recorded with missing characters, so their lines are not CAN frames;
-//! packwatch reads no answer from such cases.
+//! Two differences from the reference decoder are allowed. The reference decoder clamps values that packwatch reports
+//! as out of range. packwatch reads nothing from cases that were recorded with missing characters.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -16,7 +15,7 @@ use packwatch::can::uds::Answer;
 use packwatch::quantity::{Channel, Fault, Timestamp};
 use toml::Value;
 
-/// The signal sets, in the data folder or the folder next to it.
+/// The signal sets, in the measured data folder or in the folder `more-data` next to it.
 pub(crate) fn folder() -> PathBuf {
     let inside = measured::path("obd");
     if inside.is_dir() { inside } else { measured::path("../more-data/obd") }
@@ -27,25 +26,24 @@ fn import(args: &[&str]) -> String {
     String::from_utf8(output.success().get_output().stdout.clone()).unwrap()
 }
 
-/// Reading of one signal.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Reading {
     Value(f64),
-    /// The limits of the range in the file.
+    /// Limits of the signal's range.
     OutOfRange(f64, f64),
     Other(Fault),
 }
 
-/// A signal set of one model year as the core reads it; every signal is bound to an input.
+/// A signal set of one model year as the core reads it. Every signal is an input.
 struct ImportedCar {
     text: String,
     answers: Vec<Answer>,
-    /// Name and range of the signal bound to temperature sensor n.
+    /// Name and range of each signal. Signal n is temperature sensor n.
     signals: Vec<(String, (f64, f64))>,
 }
 
-/// Required inputs in a separate answer. The imported signals are bound as temperatures, the most numerous kind of
-/// input.
+/// Required inputs, in a separate answer. The imported signals become temperatures because a pack may have the most
+/// inputs of this kind.
 const OTHER_INPUTS: &str = "[[input.diagnostic]]\nname = \"Other\"\nrequest = 1\nresponse = 2\nservice = 0x22\nidentifier = 1\n\
     signals = [{ name = \"Cell{n}\", numbers = \"1-1024\", bit = 0, length = 8 }, { name = \"Current\", bit = 9000, length = 8 }]\n";
 
@@ -59,7 +57,7 @@ impl ImportedCar {
              signal = \"Other.Current\"\npositive = \"charge\"\n[input.cell_voltage]\nsignal = \"Other.Cell{{n}}\"\n"
         );
         for (number, (name, _)) in (1..).zip(&signals) {
-            // With an explicit scale, packwatch accepts any unit of the signal.
+            // With an explicit scale, packwatch accepts a signal of any unit.
             writeln!(config, "[[input.temperature]]\nsignal = \"{name}\"\nscale = 1.0\ncells = \"{number}\"").unwrap();
         }
         let folder = tempfile::tempdir().unwrap();
@@ -69,7 +67,6 @@ impl ImportedCar {
         Self { text, answers, signals }
     }
 
-    /// Readings of a complete answer, by signal.
     fn decode(&self, response: CanId, answer: &[u8]) -> BTreeMap<&str, Reading> {
         let question = |found: &&Answer| {
             found.question.controller.response == response && answer.starts_with(&found.question.answer_head())
@@ -91,7 +88,7 @@ impl ImportedCar {
     }
 }
 
-/// Every signal of a file with its range; series are expanded.
+/// Every signal of a file with its range. A series gives several signals.
 fn signals_of(tables: &toml::Table) -> Vec<(String, (f64, f64))> {
     let mut signals = Vec::new();
     for table in tables["input"]["diagnostic"].as_array().unwrap() {
@@ -120,8 +117,9 @@ pub(crate) struct Case {
     response: String,
 }
 
-/// Reads a file of cases. Lines below `expected_values` have the form `ID: VALUE`. The frames follow below `response`,
-/// either as the lines of a block (`|-`) or in a quoted text, where `\n` ends a frame and a line end is a space.
+/// Reads a file of cases. Lines below `expected_values` have the form `ID: VALUE`. Frames follow below `response`,
+/// either as the lines of a block (`|-`) or as a quoted text. In a quoted text, `\n` ends a frame and a line end is a
+/// space.
 pub(crate) fn cases(text: &str) -> Vec<Case> {
     let mut cases: Vec<Case> = Vec::new();
     for line in text.lines().map(str::trim_end) {
@@ -149,7 +147,8 @@ impl Case {
     }
 }
 
-/// Identifier and payload of every complete answer, reassembled by the core. Skips lines that are not classic frames.
+/// Identifier and payload of every complete answer, reassembled by the core. Lines that are not classic frames are
+/// skipped.
 fn reassemble(frames: &[String]) -> Vec<(CanId, Vec<u8>)> {
     let mut receiver = Receiver::new(None);
     let mut answers = Vec::new();
@@ -170,13 +169,12 @@ fn frame_of(text: &str) -> Option<(CanId, Vec<u8>)> {
     (1..=8).contains(&bytes.len()).then_some((id, bytes))
 }
 
-/// Results of the comparison.
 #[derive(Debug, Default, PartialEq)]
 struct Comparison {
     equal: usize,
     clamped: usize,
     enumerations: usize,
-    /// Cases without a complete answer, because a line is not a CAN frame.
+    /// Cases without a complete answer because a line is not a CAN frame.
     damaged: usize,
     different: Vec<String>,
 }
@@ -210,12 +208,12 @@ impl Comparison {
     }
 }
 
-/// Expected values are rounded to five decimals, large ones to seven digits.
+/// Whether the values agree. Expected values are rounded to five decimals, large values to seven digits.
 fn near(found: f64, expected: f64) -> bool {
     (found - expected).abs() <= 6e-6 + 1e-6 * expected.abs()
 }
 
-/// The name without leading zeros in its numbers, because names in a series have no leading zeros.
+/// The name with leading zeros removed from its numbers. Names in a series have no leading zeros.
 fn without_zeros(name: &str) -> String {
     let mut short = String::new();
     let mut chars = name.chars().peekable();

@@ -1,6 +1,5 @@
-//! Compares packwatch's ISO-TP with an independent implementation, PyPI `can-isotp`, run by the interpreter that
-//! `PACKWATCH_PYTHON` names. packwatch must reassemble the peer's segmented messages despite loss, delay and
-//! interleaved senders, and the peer must reassemble packwatch's.
+//! Compares packwatch's ISO-TP with PyPI `can-isotp` (interpreter `PACKWATCH_PYTHON`). Each must reassemble the other's
+//! segmented messages, packwatch despite loss, delay and interleaved senders.
 
 use std::collections::BTreeMap;
 use std::io::Write;
@@ -18,7 +17,6 @@ const MESSAGES: usize = 10_000;
 /// Number of senders. Each has its own identifier, and their frames interleave.
 const SENDERS: usize = 5;
 
-/// The peer's answer to each line.
 fn ask(python: &std::ffi::OsString, way: &str, lines: &[String]) -> Vec<String> {
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/tools/isotp_oracle.py");
     let mut child =
@@ -42,7 +40,7 @@ impl Chance {
         usize::try_from(self.0.next_u32()).unwrap() % limit
     }
 
-    /// Messages of 1 to 4,095 bytes, mostly short, as in diagnostics.
+    /// Messages of 1 to 4,095 bytes. Most are short, as in diagnostics.
     fn messages(&mut self) -> Vec<Vec<u8>> {
         let lengths: Vec<usize> = (0..MESSAGES)
             .map(|_| match self.below(20) {
@@ -59,7 +57,6 @@ impl Chance {
     }
 }
 
-/// A frame on the bus.
 struct SentFrame {
     ms: i64,
     sender: usize,
@@ -75,7 +72,6 @@ fn peer_messages_are_reassembled_despite_loss() {
     let lines: Vec<String> = messages.iter().map(|message| hex(message)).collect();
     let cut = ask(&python, "send", &lines);
     assert_eq!(cut.len(), MESSAGES);
-    // Each sender sends its messages in order; the bus interleaves the frames of all senders.
     let mut bus: Vec<SentFrame> = Vec::new();
     let mut intact = vec![true; MESSAGES];
     let mut clocks = [0_i64; SENDERS];

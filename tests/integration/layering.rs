@@ -1,9 +1,8 @@
-//! Checks the code against the map in `src/lib.rs`. Reads `src/` and reports, with file and line, each module that
-//! names a module it may not import, and each place where the core names a runtime, a clock, a file, a socket or a
-//! print.
+//! Checks the code against the map in `src/lib.rs`. No module may name a module that it may not import. The core may
+//! not name a runtime, a clock, a file, a socket or a print.
 //!
-//! Comments, documentation and literals are ignored. Test modules are checked, so that they stay as pure as the code
-//! they test. Paths are resolved from `crate::`, from chains of `super::` that reach the crate root, and inside braces.
+//! Comments, documentation and literals are ignored. Paths are resolved from `crate::`, from chains of `super::` that
+//! reach the crate root, and inside braces.
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -41,7 +40,7 @@ const TABLE: &[(&str, &[&str], Core)] = &[
     ("wiring_check", MODULES.split_at(20).0, Core::Shell),
     ("failure", &["config"], Core::Shell),
     ("lab", BELOW_LAB, Core::Shell),
-    // A separate program: it reads the daemon's status and uses nothing of the daemon's loop.
+    // A separate program. It reads the daemon's status but does not use the daemon's loop.
     (
         "uplink",
         &["quantity", "cell_faults", "alarm", "monitor", "io", "logging", "control", "status", "http", "failure"],
@@ -102,16 +101,16 @@ enum Core {
     Shell,
 }
 
-/// Paths that the core must not name: they read a clock, a file, a socket or the environment, or log.
+/// The core must not name these paths: they read a clock, a file, a socket or the environment, or log.
 const IMPURE_PATHS: &[&str] = &["tokio", "tracing", "std::fs", "std::net", "std::env", "std::process"];
-/// Names that the core must not use, by any path.
+/// The core must not use these names with any path.
 const IMPURE_NAMES: &[&str] = &["Instant", "SystemTime"];
-/// Macros that the core must not call.
 const IMPURE_MACROS: &[&str] = &["println", "eprintln", "print", "eprint", "dbg"];
-/// Paths forbidden to a single module: the simulated truth must not use the code that is judged against it.
+/// Module, and path that it must not use. The simulator computes the truth, so it must not use the estimator under
+/// test.
 const FORBIDDEN_TO: &[(&str, &str)] = &[("sim", "crate::cell::estimator")];
 
-/// Tests that may name one more module: the store's tests run a replay that records to the store.
+/// Test file, and the additional module that it may name. The store's tests run a replay that records to the store.
 const ALLOWED_IN_TESTS: &[(&str, &str)] = &[("host/store/tests.rs", "crate::replay")];
 
 /// A word or a punctuation mark of the source, without comments and literals.
@@ -139,7 +138,7 @@ fn tokens(source: &str) -> Vec<Token> {
     found
 }
 
-/// End of the white space, comment or literal that starts at `at`; `None` if a token starts there.
+/// End of the white space, comment or literal that starts at `at`. `None` if a token starts there.
 fn skipped(chars: &[char], at: usize) -> Option<usize> {
     let next = chars.get(at + 1).copied();
     match chars[at] {
@@ -181,7 +180,7 @@ fn string_end(chars: &[char], start: usize) -> usize {
     (at + 1).min(chars.len())
 }
 
-/// End of the raw string (`r"`, `br#"`, ...) that starts at `at`; `None` if there is no raw string.
+/// End of the raw string (`r"`, `br#"`, ...) that starts at `at`. `None` if no raw string starts there.
 fn raw_string_end(chars: &[char], at: usize) -> Option<usize> {
     let r = find(chars, at, |rest| rest[0] != 'b' && rest[0] != 'c');
     let open = find(chars, r + 1, |rest| rest[0] != '#');
@@ -212,8 +211,8 @@ fn token_end(chars: &[char], at: usize) -> usize {
     }
 }
 
-/// Every path in a text, with braces expanded: `use std::{fs, net::TcpStream}` gives two. `depth` is the module depth
-/// of the text; a chain of `super` that reaches the root becomes `crate`.
+/// Every path in a text, with braces expanded: `use std::{fs, net::TcpStream}` gives two paths. `depth` is the module
+/// depth of the text. A chain of `super` that reaches the root becomes `crate`.
 fn paths(tokens: &[Token], depth: usize) -> Vec<(usize, String)> {
     let mut found = Vec::new();
     let (mut at, mut braces) = (0, 0_usize);
@@ -283,7 +282,7 @@ fn from_root(path: &str, depth: usize) -> String {
     relative.split("::").skip(supers).fold("crate".to_owned(), |root, part| root + "::" + part)
 }
 
-/// Module of a file below `src`, and the file's module depth in its crate.
+/// Module of a file below `src`, and the module depth of the file in its crate.
 fn place(file: &str) -> (&str, usize) {
     let mut parts: Vec<&str> = file.trim_end_matches(".rs").split('/').filter(|part| *part != "mod").collect();
     let member = CRATES.iter().find(|(name, _)| parts.len() > 1 && parts[0] == *name);
@@ -308,7 +307,7 @@ fn in_one_crate(path: &str) -> String {
     }
 }
 
-/// Violations in one file, one per line, as `file:line: text`.
+/// Violations in one file, as lines `file:line: text`.
 fn violations(file: &str, source: &str) -> Vec<String> {
     let (module, depth) = place(file);
     let Some((_, allowed, core)) = TABLE.iter().find(|(name, ..)| *name == module) else {

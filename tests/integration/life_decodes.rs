@@ -1,5 +1,5 @@
-//! Replays whole simulated lives. `cantools` decodes every frame with the DBC that `packwatch dbc` writes. The
-//! values must match the estimates and events of the same replay to within one step of the signal.
+//! Replays simulated lives. `cantools` decodes every sent frame with the DBC of `packwatch dbc`. The values must match
+//! the replay's estimates and events within one step of the signal.
 
 use std::ffi::OsString;
 use std::fs;
@@ -8,7 +8,6 @@ use std::process::Command;
 
 use packwatch::can::e2e::Protection;
 
-/// A life to replay.
 struct Life {
     config: String,
     simulate: &'static [&'static str],
@@ -19,7 +18,7 @@ fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
 }
 
-/// The interpreter that `PACKWATCH_PYTHON` names. If the variable is not set, prints a note and returns `None`.
+/// The value of `PACKWATCH_PYTHON`. If the variable is not set, prints a note and returns `None`.
 fn python() -> Option<OsString> {
     let python = std::env::var_os("PACKWATCH_PYTHON");
     if python.is_none() {
@@ -33,7 +32,7 @@ fn packwatch(arguments: &[&str], folder: &Path) {
     command.current_dir(folder).args(arguments).assert().success();
 }
 
-/// A shipped configuration with texts replaced and absolute file paths.
+/// A shipped configuration with some text replaced and with absolute file paths.
 fn config(name: &str, replaced: &[(&str, &str)]) -> String {
     let mut text = fs::read_to_string(root().join("config").join(name)).unwrap();
     let folder = root().join("config").display().to_string();
@@ -48,7 +47,7 @@ fn config(name: &str, replaced: &[(&str, &str)]) -> String {
     text
 }
 
-/// Writes the life's frames, estimates and events to `folder`. Returns the findings of `tests/tools/life_decodes.py`.
+/// Writes the life's frames, estimates and events to `folder`. Returns the output of `tests/tools/life_decodes.py`.
 /// Panics if a value disagrees.
 fn decode(python: &OsString, life: &Life, folder: &Path) -> serde_json::Value {
     fs::write(folder.join("pack.toml"), &life.config).unwrap();
@@ -69,7 +68,6 @@ fn decode(python: &OsString, life: &Life, folder: &Path) -> serde_json::Value {
         "{} cells: {} values in {}, {} changed without a report",
         found["cells"], found["values"], found["frames"], found["restated"]
     );
-    // Every frame must have been decoded.
     let sent = fs::read_to_string(folder.join("out.log")).unwrap().lines().count();
     let frames = ["Status", "Health", "Alarm", "Digest"].map(|name| found["frames"][name].as_u64().unwrap());
     assert_eq!(frames.iter().sum::<u64>(), u64::try_from(sent).unwrap());
@@ -97,7 +95,7 @@ fn life_frames_decode_to_replay_values() {
     assert!(found["unreported"].as_u64().unwrap() < 100, "only the unfinished charge at the log's end may be missing");
 }
 
-/// The example's pack reduced to eight cells; each kind of frame is protected by a different profile.
+/// The example's pack, reduced to eight cells. Each kind of frame is protected by a different profile.
 fn protected_pack() -> String {
     let whole = config("example.toml", &[]);
     let (before, sensors) = whole.split_once("[[input.temperature]]").unwrap();

@@ -1,4 +1,4 @@
-//! Runs commands on logs in other tools' formats, on files that are no logs, and `look` on a drive.
+//! Tests commands on logs in other tools' formats, on files that are not logs, and `look` on a drive.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -27,7 +27,6 @@ fn stdout(assert: &assert_cmd::assert::Assert) -> String {
     String::from_utf8_lossy(&assert.get_output().stdout).into_owned()
 }
 
-/// The estimates of a log with the example's configuration.
 fn estimates(folder: &Path, log: &str) -> String {
     let (config, out) = (example("pack.toml"), folder.join("estimates.csv"));
     let args = ["replay", "-c", config.to_str().unwrap(), log, "--estimates", out.to_str().unwrap()];
@@ -83,7 +82,7 @@ fn drive_in_other_formats_gives_same_estimates() {
     for log in &logs {
         assert!(estimates(folder, log) == expected, "{log}");
     }
-    // Formats recorded on another interface give the same estimates as soon as their channel is named.
+    // A log recorded on another channel gives the same estimates if the channel is mapped to the configured interface.
     let other = write(folder, "e.log", "base hex timestamps absolute\n", |us, id, bytes| {
         format!("{} 3 {id} Rx d 8 {bytes}", seconds(us))
     });
@@ -170,13 +169,13 @@ fn look_writes_report_or_asks() {
     assert!(fs::read_to_string(&out).unwrap().contains("</html>"));
     let text = stderr(&packwatch(&["look", "-", "--label", "nmc:2.6Ah"]).code(1));
     assert!(text.contains("-: must be a file"), "{text}");
-    // Without a DBC, the fields are written to pack.dbc, which must not replace another file.
+    // Without a DBC, `look` writes the fields to a DBC file. `look` must not replace an existing file.
     let (car, own) = (path("car.toml"), path("car.dbc"));
     fs::write(&own, "MINE").unwrap();
     let text = stderr(&packwatch(&["look", log, "--label", "nmc:2.6Ah:4s", "--out", &out, "--write", &car]).code(1));
     assert!(text.contains("car.dbc: exists and would be replaced"), "{text}");
     assert_eq!(fs::read_to_string(&own).unwrap(), "MINE");
-    // A table needs the label only.
+    // A table needs only the label.
     let table = path("drive.csv");
     let row = |n: i32| format!("{n},{},{:.3}\n", n / 20 % 3, 3.9 - f64::from(n) * 1e-4 - 0.04 * f64::from(n / 20 % 3));
     fs::write(&table, format!("time,current,voltage\n{}", (0..900).map(row).collect::<String>())).unwrap();
@@ -186,7 +185,7 @@ fn look_writes_report_or_asks() {
     }
     let text = stderr(&packwatch(&["look", &table, "--out", &out]).code(1));
     assert!(text.contains("which battery is it?"), "{text}");
-    // A configuration that exists replaces the label. What cannot be read is named.
+    // An existing configuration replaces the label. The message about an unreadable file must name the file.
     let own = path("table.toml");
     let [first, again] = [&["--label", "nmc:2.6Ah"][..], &[]].map(|label| {
         let output = packwatch(&[&["look", &table, "--out", &out, "--write", &own], label].concat()).success();
@@ -203,7 +202,6 @@ fn look_writes_report_or_asks() {
     fs::write(&table, "").unwrap();
     let text = stderr(&packwatch(&["look", &table, "--label", "nmc:2.6Ah:4s", "--out", &out]).code(1));
     assert_eq!(text.matches("drive.csv: is empty").count(), 1, "{text}");
-    // An edited configuration is used and kept.
     let edited = fs::read_to_string(&pack).unwrap().replace("rated_capacity_ah = 2.6", "rated_capacity_ah = 2.5");
     fs::write(&pack, &edited).unwrap();
     let text = stdout(&packwatch(&args).success());

@@ -206,7 +206,7 @@ fn read(
     Ok((records, source.counts().clone()))
 }
 
-/// Reads the same files in batches of up to `max` records.
+/// Reads the files in batches of up to `max` records.
 fn read_batches(paths: &[PathBuf], strict: bool, max: usize) -> Result<(Vec<Record>, LogCounts), LogError> {
     let mut source = LogSource::new(paths.to_vec(), options(strict));
     let (mut batch, mut records) = (Batch::new(max), Vec::new());
@@ -218,7 +218,7 @@ fn read_batches(paths: &[PathBuf], strict: bool, max: usize) -> Result<(Vec<Reco
     Ok((records, source.counts().clone()))
 }
 
-/// Log files with lines of every kind: usual, unusual, malformed, of other interfaces, and without a line end.
+/// Log files with lines of every kind: usual, unusual, malformed, from other interfaces, and without a line end.
 fn any_log() -> impl Strategy<Value = Vec<u8>> {
     let usual = "\\(000000000[0-9]\\.[0-9]{6}\\) can[012] [0-7][0-9A-F]{2}#([0-9A-F]{2}){0,8}\r?\n";
     let unusual = "\\([0-9]{1,3}\\.[0-9]{6}\\)  ?can[01] [0-7][0-9A-F]{2}#[R#]?([0-9A-F]{2}){0,9}( [RTX])?\n";
@@ -244,13 +244,14 @@ proptest! {
         let paths: Vec<_> = logs.iter().zip(0..).map(|(log, n)| file(folder.path(), &format!("{n}.log"), log)).collect();
         let one_by_one = read(&paths, strict, |_| {});
         prop_assert_eq!(read_batches(&paths, strict, max), one_by_one);
-        // With extra spaces no line takes the fast path; nothing else changes.
+        // With extra spaces, no line takes the fast path. The result must not change.
         let spread: Vec<_> = logs.iter().zip(0..).map(|(log, n)| {
             let text = String::from_utf8_lossy(log).replace(") can", ")  can");
             file(folder.path(), &format!("{n}.log"), text.as_bytes())
         }).collect();
         if !strict {
-            // A log whose first line contains a comma is read as a table and rejected; then both reads must fail.
+            // If the first line of a log contains a comma, the log is read as a table and rejected. Then both reads
+            // must fail.
             match (read(&spread, strict, |_| {}), read_batches(&paths, strict, max)) {
                 (Ok((wide, mut counts)), Ok((records, mut plain))) => {
                     (counts.first_bad_line, plain.first_bad_line) = (None, None);
@@ -369,7 +370,7 @@ fn journal_reads_back_as_written() {
     assert_eq!(records[3..], inputs);
     assert_eq!((counts.bad_lines, counts.ignored_lines, counts.time_backwards), (0, 1, 1));
 
-    // Cut the file in the middle of its last line: the line must not be read as a shorter one.
+    // The rest of the cut line must not be read as a shorter line.
     let (records, counts) = read(&[file(folder.path(), "t", &text[..text.len() - 2])], false, |_| {}).expect("read");
     assert_eq!((records.len(), counts.bad_lines), (inputs.len() + 2, 1));
 }
@@ -392,7 +393,7 @@ fn lost_frame_counts_saturate() {
     let journal = file(folder.path(), "j", format!("PACKWATCH-JOURNAL 1\n{line}{line}").as_bytes());
     let (records, counts) = read(&[journal], true, |_| {}).expect("read");
     assert_eq!((records, counts.bad_lines), (vec![lost, lost], 0));
-    // A number of lost frames above the largest possible one makes the line invalid.
+    // If the number of lost frames exceeds the largest possible number, the line is invalid.
     let beyond = MOST_DROPPED.replace("dropped 18446744073709551615", "dropped 18446744073709551616");
     let (records, counts) = read(&[file(folder.path(), "b.log", beyond.as_bytes())], false, |_| {}).expect("read");
     assert_eq!((records.len(), counts.dropped_frames, counts.ignored_lines), (1, 0, 2));

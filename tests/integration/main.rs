@@ -1,8 +1,8 @@
-//! The integration tests. They form one program with a module per subject, so that they are compiled and linked once.
+//! The integration tests. They form one program, so that they are compiled and linked once. They work with `cargo
+//! nextest run` (one process per test) and with `cargo test` (one process, threads).
 //!
-//! `cargo nextest run` runs each test in its own process, `cargo test` runs all of them as threads of one process; the
-//! tests work with both. To run one subject: `cargo test --test integration doctor::`. Shared helpers are in `support`.
-//! `tests/allocations.rs` is a separate program because it replaces the global allocator.
+//! One subject: `cargo test --test integration doctor::`. `tests/allocations.rs` is a separate program because it
+//! replaces the global allocator.
 #![allow(
     clippy::unwrap_used,
     clippy::print_stdout,

@@ -1,7 +1,7 @@
-//! Build script: sets `cfg(measured_data)` if measured data are present. Otherwise the tests that need them are ignored
-//! (and counted as skipped).
+//! Build script. Sets `cfg(measured_data)` if measured data are present. Otherwise the tests that need them are
+//! ignored.
 //!
-//! `PACKWATCH_DATA` names the folder; the default is `../shared/data` next to the project.
+//! `PACKWATCH_DATA` names the data folder; the default is `../shared/data` next to the project.
 #![expect(clippy::print_stdout, reason = "Cargo reads the output of a build script")]
 
 use std::path::{Path, PathBuf};

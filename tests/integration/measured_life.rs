@@ -1,10 +1,10 @@
 //! Replays whole lives of measured cells (NASA PCoE B0005, B0006) and compares the estimated with the published
 //! capacities.
 //!
-//! The published capacity is the charge delivered at 2 A down to 2.7 V (for both cells, even where the cycler
-//! discharged further), so the test compares it with the usable capacity. Discharges are numbered from 1. The
-//! published capacity of B0005 first falls below 1.4 Ah at discharge 125 and never below 1.2 Ah. The capacity of
-//! B0006 first falls below 1.4 Ah at discharge 109. Each model was fitted to its cell's first five cycles only.
+//! The published capacity is the charge delivered at 2 A down to 2.7 V, so the test compares it with the usable
+//! capacity. This limit applies to both cells, even where the cycler discharged further. Discharges are numbered from
+//! 1. The published capacity first falls below 1.4 Ah at discharge 125 (B0005) and 109 (B0006). That of B0005 never
+//! falls below 1.2 Ah. Each model was fitted only to its cell's first five cycles.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -37,7 +37,8 @@ fn seconds(stamp: &str) -> f64 {
         + stamp[17..].parse::<f64>().unwrap()
 }
 
-/// Writes the shipped configuration for `cell`, with absolute paths and `changes` made to its text, to `folder`.
+/// Writes the shipped configuration for `cell` to `folder`, with absolute paths. `changes` are text replacements;
+/// `more` is appended.
 fn configuration(folder: &Path, cell: &str, changes: &[(&str, &str)], more: &str) -> PathBuf {
     let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
     let mut text = std::fs::read_to_string(shipped.join("measured.toml")).unwrap();
@@ -82,16 +83,14 @@ fn discharge_of(event: &Value, discharges: &[Discharge]) -> usize {
     discharges.iter().filter(|discharge| discharge.start_s <= time_s).count()
 }
 
-/// The usable capacity reported after a discharge.
 struct UsableCapacityReport {
     discharge: usize,
     usable_ah: f64,
     std_ah: f64,
-    /// Difference from the published capacity.
     error_ah: f64,
 }
 
-/// Usable capacities reported after each discharge from number 11 on.
+/// Usable capacities reported after each discharge, from number 11 on.
 fn usable_errors(events: &[Value], discharges: &[Discharge]) -> Vec<UsableCapacityReport> {
     let mut stated = Vec::new();
     let mut mode = "";
@@ -137,11 +136,10 @@ fn alarm_comes_at_end_of_life() {
     assert_eq!(raised(1.2), None, "the published capacity never falls below 1.2 Ah");
 }
 
-/// Errors of the usable capacity over a whole life.
 struct Score {
     mean_absolute_ah: f64,
     covered: f64,
-    /// Number of the first discharge after which the usable capacity was below 1.4 Ah.
+    /// Number of the first discharge after which the estimated usable capacity was below 1.4 Ah.
     first_below: Option<usize>,
 }
 
@@ -186,7 +184,7 @@ fn usable_capacity_converges_from_wrong_start() {
     }
 }
 
-/// For each run: the seed of the windows, and the unit of their length.
+/// Seed of the windows, and unit of their length, for each run.
 const RUNS: [(u64, WindowUnit); 4] =
     [(1, WindowUnit::Duration), (2, WindowUnit::Duration), (3, WindowUnit::Charge), (4, WindowUnit::Charge)];
 
@@ -214,11 +212,11 @@ fn usable_capacity_is_learned_from_windows() {
             assert!(life.mean_absolute_ah < 0.085, "{cell} {by} {seed}: {} Ah", life.mean_absolute_ah);
             (sum_ah, sum_covered) = (sum_ah + life.mean_absolute_ah, sum_covered + life.covered);
         }
-        // One set of windows can be bad as a whole, because the voltage curve has the same error each time that the SOC
-        // is the same. The limit of the mean is therefore lower.
+        // The voltage curve has the same error whenever the SOC is the same, so a whole set of windows can be bad. The
+        // mean over the sets therefore has a lower limit.
         let (mean_ah, covered) = (sum_ah / RUNS.len() as f64, sum_covered / RUNS.len() as f64);
         assert!(mean_ah < 0.065, "{cell}: {mean_ah} Ah");
-        // Coverage is too low: the interval does not include curve errors that differ between the two ends of a window.
+        // The interval covers too few true values: it ignores curve errors that differ between the ends of a window.
         assert!(covered > 0.4, "{cell}: {covered}");
     }
 }

@@ -1,9 +1,8 @@
-//! Makes the wiring faults that people make, one at a time, in right configurations. `packwatch doctor` must name each
-//! fault in words, and must find nothing wrong in the right configurations.
+//! Puts common wiring mistakes into correct configurations, one at a time. `packwatch doctor` must name each mistake,
+//! and must find nothing in the correct configurations.
 //!
-//! The packs: 4 LFP cells with single voltages and 96 NMC cells with a total voltage, both simulated over a discharge and
-//! a charge, with a state of charge, a state of health, a cycle counter and a MOSFET temperature on the bus; and, if the
-//! measured data are present, a boat (16 LFP cells), a Kona (total voltage) and other cars.
+//! Two packs are simulated: 4 LFP cells with single voltages, and 96 NMC cells with a total voltage. If the measured
+//! data are present, a boat (16 LFP cells), a Kona (total voltage) and other cars are also tested.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -70,7 +69,6 @@ max_age_s = 3.0
 max_age_s = 4.0
 "#;
 
-/// The pack with a total voltage.
 fn total() -> String {
     let edits = [
         ("lfp-graphite", "nmc-graphite"),
@@ -82,7 +80,7 @@ fn total() -> String {
     edits.iter().fold(CELLS.to_owned(), |text, (from, to)| text.replace(from, to))
 }
 
-/// A pack: the files of its folder, its right configuration and its log.
+/// A pack: the files in its folder, its correct configuration and its log.
 #[derive(Debug, Clone)]
 struct Pack {
     files: BTreeMap<String, String>,
@@ -92,7 +90,6 @@ struct Pack {
 }
 
 impl Pack {
-    /// Runs the doctor with an edited configuration. Returns the exit code and the words of its output.
     fn doctor(&self, edits: &[(&str, &str)]) -> (i32, String) {
         let folder = tempfile::tempdir().unwrap();
         let (mut config, mut files) = (self.config.clone(), self.files.clone());
@@ -117,7 +114,7 @@ impl Pack {
 }
 
 impl Pack {
-    /// The pack with another log. `change` receives the seconds since the start and a line, and returns the new line.
+    /// The pack with another log. `change` maps seconds since the start and a line to the new line, or `None`.
     fn with_lines(&self, name: &str, change: impl Fn(f64, &str) -> Option<String>) -> Self {
         let text = std::fs::read_to_string(&self.log).unwrap();
         let time_s = |line: &str| line[1..18].parse::<f64>().unwrap() - 1.7e9;
@@ -157,7 +154,7 @@ fn simulated(name: &str, config: String) -> Pack {
     Pack { files: BTreeMap::from([("pack.dbc".to_owned(), DBC.to_owned())]), config, log, arguments: &[] }
 }
 
-/// The line; after a temperature, also the reported values.
+/// The unchanged line. After a temperature line, also adds the values that the controller reports.
 fn reported(line: &str, socs: &[(f64, f64)]) -> String {
     let (stamp, frame) = line.split_once(" can0 ").unwrap();
     let Some(data) = frame.strip_prefix("101#") else { return format!("{line}\n") };
@@ -170,7 +167,7 @@ fn reported(line: &str, socs: &[(f64, f64)]) -> String {
     format!("{stamp} can0 101#{}{warm}00000000\n{stamp} can0 102#{summary}\n", &data[..4])
 }
 
-/// A mistake: its number in the list of mistakes, the edits that make it, and words that name it.
+/// A mistake: its number (or the name of its pack), the edits that make it, and words that must occur in the output.
 type Mistake = (&'static str, &'static [(&'static str, &'static str)], &'static [&'static str]);
 
 const OF_CELLS: &[Mistake] = &[
@@ -216,7 +213,7 @@ const OF_TOTAL: &[Mistake] = &[
     ("14", &[("nmc-graphite", "lfp-graphite")], &["100 to 145 cells", "pack.chemistry is wrong", "nmc-graphite"]),
 ];
 
-/// Tries the mistakes of a pack. Returns those that are not named.
+/// Tries the mistakes on a pack. Returns a message for each mistake that the doctor does not name.
 fn unnamed(name: &str, pack: &Pack, mistakes: &[Mistake]) -> Vec<String> {
     let (code, text) = pack.doctor(&[]);
     let mut failed = Vec::new();
@@ -239,9 +236,14 @@ fn simulated_mistakes_are_named_and_right_packs_silent() {
     assert!(failed.is_empty(), "{}", failed.join("\n\n"));
 }
 
-/// A right pack of 100 Ah as a vehicle has it: name; chemistry is LFP; state of charge at the start; length (s); current
-/// (A, positive = discharge; NaN = the controller sleeps) at a time (s) and a voltage (V per cell); and the reported state
-/// of charge at a time and a true state of charge.
+/// A correct pack of 100 Ah, as found in vehicles:
+///
+/// - name
+/// - whether the chemistry is LFP
+/// - SOC at the start
+/// - duration (s)
+/// - current (A, positive = discharge) at a time (s) and a voltage (V per cell); NaN: the controller sleeps
+/// - reported SOC at a time (s) and a true SOC
 type RightPack = (&'static str, bool, f64, u32, fn(f64, f64) -> f64, fn(f64, f64) -> f64);
 
 const RIGHT: &[RightPack] = &[
@@ -259,7 +261,7 @@ const RIGHT: &[RightPack] = &[
     ("coarse SOC", false, 0.9, 5000, drive_a, |_, soc| (200.0 * soc + 1.0).floor() / 200.0),
 ];
 
-/// Faults in a right pack: its name, the edits and the words that name the fault.
+/// Mistakes in the packs of [`RIGHT`]. The first field is the name of the pack.
 const WRONG: &[Mistake] = &[
     ("constant current", &[("\"charge\"", "\"discharge\"")], &["sign of the current is inverted"]),
     ("constant power", &[("\"charge\"", "\"discharge\"")], &["sign of the current is inverted"]),
@@ -275,13 +277,14 @@ fn true_soc(_: f64, soc: f64) -> f64 {
     soc
 }
 
-/// Loads and recuperation, for some seconds each.
+/// Load current (A): changes every 7 s, with pauses and recuperation.
 fn drive_a(time_s: f64, _: f64) -> f64 {
     let step = (time_s / 7.0).floor();
     if step % 5.0 == 0.0 { 0.0 } else { 20.0 + 60.0 * (1.7 * step).sin() }
 }
 
-/// Open-circuit voltage (V) at 0, 10, ... 100 %: typical of the chemistry, and not from the program's model.
+/// Open-circuit voltage (V), from a table at 0, 10, ... 100 %. The curves are typical of the chemistry and independent
+/// of packwatch's cell model.
 fn ocv_v(is_lfp: bool, soc: f64) -> f64 {
     let curve = match is_lfp {
         true => [2.6, 3.2, 3.24, 3.275, 3.287, 3.29, 3.295, 3.318, 3.33, 3.332, 3.45],
@@ -289,7 +292,6 @@ fn ocv_v(is_lfp: bool, soc: f64) -> f64 {
     };
     let at = (10.0 * soc).clamp(0.0, 9.999);
     let first = at as usize;
-    // The voltage of a full cell rises steeply.
     curve[first] + (at - first as f64) * (curve[first + 1] - curve[first]) + 10.0 * (soc - 1.0).max(0.0)
 }
 
@@ -342,7 +344,7 @@ fn right_packs_of_vehicles_are_silent_and_their_faults_named() {
 
 #[test]
 fn hole_in_log_is_named_with_its_times() {
-    // 2 h of the log, or of the current alone, are missing.
+    // Two hours are missing: either of the whole log, or of the current alone.
     for (is_whole, words) in [(true, "a stretch of 2 h is missing in the log"), (false, "pack current: no reading for")]
     {
         let is_kept =
@@ -371,7 +373,7 @@ fn current_without_sign_or_direction_is_named() {
     }
 }
 
-/// A folder of further measured data, beside the folder of measured data.
+/// A folder of further measured data, next to the folder of measured data.
 fn more_data(name: &str) -> PathBuf {
     measured::path("can_ev").join("../../more-data").join(name)
 }

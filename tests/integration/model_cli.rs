@@ -20,7 +20,6 @@ fn json(args: &[&str]) -> Value {
     serde_json::from_str(&good(args)).unwrap()
 }
 
-/// Standard error of a run that must fail with this exit code.
 fn refused(code: i32, args: &[&str]) -> String {
     let output = packwatch(args);
     assert_eq!(output.status.code(), Some(code), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
@@ -29,7 +28,6 @@ fn refused(code: i32, args: &[&str]) -> String {
 
 const PANASONIC: &str = "config/cells/panasonic_18650pf.toml";
 
-/// A temporary folder.
 struct Place(tempfile::TempDir);
 
 impl Place {
@@ -79,7 +77,6 @@ fn invalid_cell_model_is_reported_last() {
     assert!(refused(1, &["cells", "/nonexistent"]).contains("/nonexistent: cannot be listed"));
 }
 
-/// Every number of a document.
 fn numbers(value: &Value, found: &mut Vec<(String, f64)>, path: &str) {
     match value {
         Value::Number(number) => found.push((path.to_owned(), number.as_f64().unwrap())),
@@ -97,7 +94,7 @@ fn show_states_valid_bands_and_priors() {
         numbers(&document, &mut found, "");
         let bands: Vec<_> = found.iter().filter(|(path, _)| path.contains("std")).collect();
         assert!(bands.len() > 5 && bands.iter().all(|(_, value)| *value >= 0.0), "{source}: {bands:?}");
-        // JSON has no NaN: it would be written as null. Null is allowed only if the model states no error.
+        // JSON has no NaN, so NaN would be written as null. Null is allowed only if the model states no error.
         let is_stated = document["soc_error_points"].is_number();
         assert_eq!(is_stated, !source.contains("nasa"), "{source}");
         let nulls = document["curve"].as_array().unwrap().iter().filter(|row| row["ocv_std_v"].is_null()).count();
@@ -179,8 +176,8 @@ fn invalid_source_error_lists_allowed_sources() {
     assert!(refused(1, &["model", "show", "--state", "config"]).contains("no history found"));
 }
 
-/// A folder with the log of a one-cell vehicle whose model was learned on board from the label alone. The log contains
-/// deep swings for most of a day, and the first readings after the night.
+/// A folder with the log of a one-cell vehicle that learns its cell model from the label alone. The log contains deep
+/// swings for most of a day, and the first readings after the night.
 fn learned() -> Place {
     let place = Place::new();
     let config = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
@@ -236,7 +233,7 @@ fn learned_model_is_shown_exported_and_reported() {
     check_report(&place, &document);
 }
 
-/// Asserts that two documents agree, numbers to within 1e-6, because a stored state keeps nine digits.
+/// Asserts that two documents agree. Numbers may differ by 1e-6 because a stored state keeps nine digits.
 fn assert_close(found: &Value, wanted: &Value) {
     match (found, wanted) {
         (Value::Array(found), Value::Array(wanted)) if found.len() == wanted.len() => {
@@ -280,7 +277,7 @@ fn learned_model_is_in_history() {
     assert_eq!(later["rows"], Value::Array(Vec::new()));
 }
 
-/// Checks that reports of the log and of the store give the same advice as `model show`.
+/// Reports of the log and of the store must give the same advice as `model show`.
 #[cfg(feature = "lab")]
 fn check_report(place: &Place, document: &Value) {
     let page = place.name("page.html");

@@ -1,4 +1,4 @@
-//! Tests alarm rules through the whole core: from input frames to events and alarm frames, and commands back.
+//! Tests alarm rules through the whole core.
 
 use crate::support::rig::{NO_VALUE, Rig, WHOLE_PACK, Wire, command_frame, learned};
 use packwatch::alarm::{AlarmState, Change, Rule, Selector};
@@ -11,7 +11,7 @@ fn hottest_sensor_raises_despite_lost_sensor() {
     let mut rig = Rig::new("[[alarm]]\nrule = \"temperature_high\"\nwarning = { set = 50, clear = 45 }\n");
     rig.seconds(2);
     assert_eq!((rig.changes(Rule::TemperatureHigh), rig.unknown_rules()), (vec![], 0));
-    // One sensor is lost. The known temperature is low, but the unknown one may be high.
+    // One sensor is lost. The other temperature is low, but the lost sensor's temperature may be high.
     rig.temperatures_c[1] = None;
     rig.seconds(4);
     assert_eq!((rig.changes(Rule::TemperatureHigh), rig.unknown_rules()), (vec![], 2));
@@ -51,12 +51,12 @@ fn empty_cell_and_spread_raise_alarms() {
     );
     rig.seconds(5);
     assert_eq!((rig.changes(Rule::SocLow), rig.changes(Rule::CellImbalance)), (vec![], vec![]));
-    // Cell 2 stays at a voltage that only an empty cell has.
+    // Cell 2 reports a voltage that only an empty cell has.
     rig.voltages_v[1] = Some(3.2);
     rig.seconds(120);
     assert_eq!(rig.changes(Rule::SocLow), [Change::Raised]);
     assert_eq!(rig.changes(Rule::CellImbalance), [Change::Raised]);
-    // Without the full cell the spread is unknown; the empty cell is unchanged.
+    // Without the full cell, the spread is unknown. The empty cell is still known.
     rig.voltages_v[0] = None;
     rig.seconds(5);
     assert_eq!(rig.changes(Rule::SocLow), [Change::Raised]);
@@ -147,8 +147,8 @@ fn bus_commands_need_protection_and_sequence() {
     assert_eq!((reported(&rig), bad(&rig)), (1, 1));
     let marked = rig.last_wire(Rule::CapacityLow);
     assert!((marked.acknowledged, marked.cell, marked.state) == (true, 0, 1), "{marked:?}");
-    // Repeat the frame, then send a frame with a wrong CRC and a frame with an unknown command. None of them is
-    // applied; at most one per second is reported.
+    // Repeat the frame, then send a wrong CRC and an unknown command. All three must be ignored, with at most one
+    // report per second.
     rig.seconds(2);
     let again = command_frame(1, 1, 0, 1);
     rig.give(Record::frame(rig.now(), BusIndex(0), &again));
@@ -160,7 +160,8 @@ fn bus_commands_need_protection_and_sequence() {
     rig.give(Record::frame(rig.now(), BusIndex(0), &harmed));
     rig.command(9, 31, 2047);
     assert_eq!((reported(&rig), bad(&rig)), (1, 2));
-    // Clearing an alarm whose value is beyond its threshold is rejected and erases nothing.
+    // While an alarm's value is beyond its threshold, the command to clear the alarm must be rejected and erase
+    // nothing.
     let capacity = rig.monitor.capacity(CellIndex(0));
     rig.command(2, 31, 2047);
     let refused = rig.events.iter().rev().find_map(|event| match event.kind {

@@ -1,12 +1,12 @@
-//! A monitor restored from a snapshot on the same clock, after any input, continues with byte-identical frames, events
-//! and estimates.
+//! Tests that a monitor restored from a snapshot continues with byte-identical frames, events and estimates.
 //!
-//! A pack of three cells runs through random drives, faults, gaps, sleep and backward clock steps. It has protected
-//! inputs, all kinds of alarms, commands from the bus and from the operator, a J1939 node and diagnostic requests. One
-//! monitor runs without interruption. The other is replaced by a monitor that is restored from its snapshot (through
-//! JSON) after random inputs; such a replacement is a cut. The same is done with a pack that learns its cell model, and
-//! with a pack whose frames are authenticated. Authenticated frames are compared without the freshness, which restarts
-//! by design.
+//! A pack of three cells runs through random drives, faults, gaps, sleep and backward clock steps. It uses all kinds of
+//! inputs, alarms and commands. One monitor runs without interruption. After random inputs, the other monitor is
+//! replaced by one that is restored from its snapshot (through JSON). Each replacement is a cut.
+//!
+//! Two more packs run in the same way: one learns its cell model, the other authenticates its frames. Authenticated
+//! frames are compared without the freshness because it restarts by design.
+//!
 //! `PACKWATCH_CUTS` sets the number of cuts.
 
 use packwatch::alarm::{Rule, Selector};
@@ -127,9 +127,8 @@ fn is_command(record: &Record) -> bool {
     matches!(record.kind, RecordKind::Frame { frame, .. } if frame.id() == CanId::Standard(1715))
 }
 
-/// A pack with a model file, one that learns its model from a label, and one with authenticated frames.
 fn configs() -> [MonitorConfig; 3] {
-    // packwatch compares cells with each other only if there are at least three.
+    // packwatch compares cells with each other only if the pack has at least three.
     let pack = PACK
         .replace("Status.Soc", "Pack.Soc")
         .replace("cells = 2\n", "cells = 3\n")
@@ -146,7 +145,6 @@ fn configs() -> [MonitorConfig; 3] {
     [pack, learning, format!("{secured}{tables}")].map(|pack| config_texts::load(&format!("{pack}{MORE}"), DBC).monitor)
 }
 
-/// The vehicle's state and its faults.
 struct Vehicle {
     encoder: InputEncoder,
     now_ns: i64,
@@ -255,7 +253,7 @@ impl Vehicle {
                 records.push(Record::frame(time, BusIndex(0), if dice.one_in(4) { &damaged } else { &frame }));
             }
             16 => self.identity = f64::from(u8::try_from(dice.below(3)).expect("small")),
-            // A single-frame answer, a two-frame answer whose second frame may be missing, or "response pending"
+            // An answer of one frame, an answer of two frames (the second may be missing), or "response pending"
             // (0x78).
             17..=30 => {
                 records.push(Record::frame(time, BusIndex(0), &tester(0x7BB, &[4, 0x61, 1, 0x20, 0x10, 0, 0, 0])))
@@ -304,7 +302,7 @@ fn outputs(monitor: &mut Monitor, record: &Record, out: &mut Outputs) -> String 
     format!("{frames:?}{:?}{:?}", out.events, out.estimates)
 }
 
-/// A sent frame without the authentication trailer. If it announces a freshness, only its identifier is kept.
+/// A sent frame without the authentication trailer. If the frame announces a freshness, no data are kept.
 fn without_freshness(sent: &Transmit) -> String {
     let Some(secured) = sent.secured else { return format!("{sent:?}") };
     let data = sent.frame.data();
@@ -320,7 +318,7 @@ fn restored(monitor: &Monitor, config: &MonitorConfig) -> Monitor {
     restored
 }
 
-/// Cuts one run at random inputs. Returns the number of cuts.
+/// Runs one seed with cuts at random inputs. Returns the number of cuts.
 fn cut(seed: u64, config: &MonitorConfig, one_in: usize) -> usize {
     let mut dice = Dice::new(seed ^ 0x5555);
     let (mut whole, mut cut) = (Monitor::new(config.clone()), Monitor::new(config.clone()));
@@ -329,11 +327,11 @@ fn cut(seed: u64, config: &MonitorConfig, one_in: usize) -> usize {
     let mut before = Timestamp::from_nanos(0);
     let is_secured = !config.authentications().is_empty();
     for (nth, record) in records(seed, 3000, config).iter().enumerate() {
-        // Skip commands: the freshness, which differs after a cut, decides whether a forged command counts as old.
+        // Skip commands. The freshness decides whether a forged command counts as old, and it differs after a cut.
         if is_secured && is_command(record) {
             continue;
         }
-        // After a long time without input, the restored monitor assumes that the program was off.
+        // After a long time without input, a restored monitor assumes that the program was off.
         let is_break = record.time.since(before).abs() > 30.0;
         before = record.time;
         if nth > 0 && !is_break && dice.one_in(one_in) {

@@ -1,7 +1,7 @@
-//! A stored state with one damaged number is rejected, or restored with finite outputs.
+//! Tests a stored state with one damaged number. It must be rejected, or restored with finite outputs.
 //!
-//! Takes the state of a two-cell pack with learned capacities as JSON and replaces each number in turn by values that
-//! damage or a failed calculation may leave. A restored state then runs through a charge and a discharge.
+//! In the state of a two-cell pack, each number in turn is replaced by values that damage or a failed calculation may
+//! leave. A restored state then runs through a charge and a discharge.
 
 use crate::support::rig::{Rig, learned};
 use packwatch::monitor::{Downtime, EventKind, Monitor, RestoreError, Snapshot};
@@ -17,7 +17,7 @@ fn numbers(value: &Value, path: &str, found: &mut Vec<String>) {
     }
 }
 
-/// Possible damaged values of a number; JSON writes non-finite numbers as null.
+/// Possible damaged values of a number. JSON writes a non-finite number as null.
 fn damages(number: &Value) -> [Value; 4] {
     let negative =
         number.as_i64().map_or_else(|| (-number.as_f64().unwrap().abs() - 1e-3).into(), |n| (-n.abs() - 1).into());
@@ -30,7 +30,7 @@ impl Rig {
         self.out.want_estimates = true;
         self.events.clear();
         self.tick_with_frames();
-        // A signal counts as missing only after some seconds, so one step of 1 s replaces ten steps of 0.1 s.
+        // A signal counts as missing only after some seconds. One step of 1 s can therefore replace ten steps of 0.1 s.
         self.deci += 9;
         let finite = self.out.estimates.drain(..).all(|estimate| {
             let e =
@@ -40,8 +40,7 @@ impl Rig {
         finite && !self.events.iter().any(|event| is_odd(&format!("{event:?}")))
     }
 
-    /// Feeds 500 samples of each cell: a charge, a rest, a discharge and a rest. Returns the second of the first
-    /// implausible output.
+    /// Feeds a charge, a rest, a discharge and a rest (500 s). Returns the second of the first implausible output.
     fn first_odd_second(&mut self) -> Option<i64> {
         (0..500).find(|second| {
             let current_a = [-20.0, 0.0, 20.0, 0.0][usize::try_from(second / 125).unwrap()];
@@ -98,7 +97,7 @@ fn rejected_state_names_number_and_range() {
     assert!(matches!(error, RestoreError::Number { cell: Some(1), .. }), "{error:?}");
     let reported = "snapshot is damaged: a variance of a cell's filter (cell 1) = -0.25, must be 1e-150 to 1e20";
     assert_eq!(error.to_string(), reported);
-    // Nothing of the state was used: the monitor starts fresh.
+    // The monitor must not use any part of the state; it starts fresh.
     rig.seconds(5);
     assert!(rig.monitor.latest().flatten().count() == 2);
 }

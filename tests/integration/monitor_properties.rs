@@ -1,7 +1,6 @@
-//! Tests properties of the whole core: a restored monitor behaves as if it had never stopped, and ticks before
-//! `next_due` may be omitted. The inputs come from the simulator: the paper's cell (with a recharge window,
-//! transitions and alarms) and a pack of 96 cells whose voltages come in many frames. Outputs are compared bit for
-//! bit (floats by their shortest text that reads back unchanged).
+//! Tests two properties of the whole core: a restored monitor behaves as if it had never stopped, and ticks before
+//! `next_due` may be omitted. The inputs are the cell of `config/paper.toml`, and a pack of 96 cells whose voltages
+//! come in many frames. Outputs are compared bit for bit.
 
 use std::path::Path;
 
@@ -18,7 +17,7 @@ fn load(file: &str) -> MonitorConfig {
     config::load(&path).unwrap_or_else(|faults| panic!("{}", faults.0.join("\n"))).monitor
 }
 
-/// The paper's cell for two and a half cycles, with a threshold that is crossed at the first half-cycle.
+/// The cell of `paper.toml` for two and a half cycles. The first half-cycle crosses the alarm threshold.
 fn paper() -> (MonitorConfig, Vec<Record>) {
     let mut config = load("paper.toml");
     config.rules[0].threshold = 2.6;
@@ -27,7 +26,7 @@ fn paper() -> (MonitorConfig, Vec<Record>) {
     (config, records)
 }
 
-/// 96 cells once a second for 20 minutes of the drive.
+/// A drive of 96 cells: 20 minutes, one sample per second.
 fn pack() -> (MonitorConfig, Vec<Record>) {
     let config = load("example.toml");
     let capacity_ah = config.model.capacity_ah;
@@ -44,7 +43,7 @@ fn pack() -> (MonitorConfig, Vec<Record>) {
     (config, records)
 }
 
-/// The simulator's frames and every tick. Simultaneous frames are spread over a few milliseconds, as on a bus.
+/// The simulator's frames and all ticks. Simultaneous frames are spread over a few milliseconds, as on a bus.
 fn stream(config: &MonitorConfig, settings: Settings, wiring: Wiring) -> Vec<Record> {
     let mut sim = Simulation::new(config.model.clone(), settings, wiring);
     let encoder = InputEncoder::new(&config.input);
@@ -65,7 +64,7 @@ fn stream(config: &MonitorConfig, settings: Settings, wiring: Wiring) -> Vec<Rec
     records
 }
 
-/// Outputs for one input, as text.
+/// Frames, events and estimates for one input, as text.
 fn outputs(monitor: &mut Monitor, record: &Record, out: &mut Outputs) -> [String; 3] {
     out.clear();
     monitor.handle(record, out);
@@ -81,7 +80,6 @@ fn outputs_with_estimates() -> Outputs {
     Outputs { want_estimates: true, ..Outputs::default() }
 }
 
-/// Fixed pseudo-random numbers below `limit`.
 fn draws(seed: u64, limit: usize) -> impl Iterator<Item = usize> {
     let mut state = seed;
     std::iter::repeat_with(move || {
@@ -135,8 +133,7 @@ fn differences(config: &MonitorConfig, records: &[Record], splits: &[usize], awa
     found
 }
 
-/// Random splits. If `same_stamp` is set (for `away` = 0 s, which means that no time passed), each split lies between
-/// two inputs of equal time.
+/// Random splits. If `same_stamp`, each split lies between two inputs of equal time, so that no time passes.
 fn splits(records: &[Record], count: usize, same_stamp: bool) -> Vec<usize> {
     draws(0x9E37_79B9_7F4A_7C15, records.len() - 2)
         .map(|k| k + 1)
@@ -149,8 +146,7 @@ fn assert_same(found: &[String]) {
     assert!(found.is_empty(), "{} differences\n{}", found.len(), found.join("\n"));
 }
 
-/// If `frames` is set, keeps the differences of frames, which also depend on the transmission schedule. Otherwise keeps
-/// the differences of the core's results.
+/// Keeps the differences of frames, which also depend on the transmission schedule, or those of the core's results.
 fn results(found: Vec<String>, frames: bool) -> Vec<String> {
     found.into_iter().filter(|line| line.contains("frames differ") == frames).collect()
 }
@@ -170,7 +166,6 @@ fn cell_restored_at_once_matches_uninterrupted_run() {
 #[test]
 fn restored_cell_learns_from_ended_mode() {
     let (config, records) = paper();
-    // The input at which the uninterrupted monitor reports its first half-cycle.
     let (mut monitor, mut out) = (Monitor::new(config.clone()), Outputs::default());
     let reported = records.iter().position(|record| {
         out.clear();
@@ -201,8 +196,8 @@ fn restored_pack_frames_match_uninterrupted_run() {
     assert_same(&results(differences(&config, &records, &splits(&records, 4, false), Downtime::AsStamped), true));
 }
 
-/// Compares a whole run with one whose configuration is `edit`ed between two splits. Returns a line for the first
-/// difference of each kind. (The event that reports the reload is excluded, because it occurs between two inputs.)
+/// Compares a whole run with a run whose configuration is `edit`ed between two splits. Returns a line for the first
+/// difference of each kind, except for the event that reports the reload.
 fn reload_differences(
     config: &MonitorConfig,
     records: &[Record],
@@ -260,7 +255,7 @@ fn reload_of_thresholds_changes_no_estimate() {
     }
 }
 
-/// Compares a run with all ticks and a run with only the ticks at `next_due`: frames and events must be equal, in
+/// Compares a run with all ticks and a run with only the ticks at `next_due`. Frames and events must be equal, in
 /// order.
 fn assert_early_ticks_have_no_effect(config: &MonitorConfig, records: &[Record]) {
     let (mut all, mut few) = (Monitor::new(config.clone()), Monitor::new(config.clone()));
@@ -293,7 +288,6 @@ fn early_ticks_have_no_effect_on_pack() {
     assert_early_ticks_have_no_effect(&config, &records);
 }
 
-/// The paper's cell with each record changed, moved or removed.
 fn edited(edit: impl Fn(f64, Record) -> Option<Record>) -> (MonitorConfig, Vec<Record>) {
     let (config, records) = paper();
     let records = records.into_iter().filter_map(|record| edit(record.time.secs(), record)).collect();
@@ -311,7 +305,7 @@ fn early_ticks_have_no_effect_on_silent_sensor() {
 
 #[test]
 fn early_ticks_have_no_effect_over_sleep() {
-    // Start the sleep between two due ticks, because the last tick before it may be omitted.
+    // The last tick before the sleep may be omitted, so start the sleep between two due ticks.
     let (config, records) = edited(|time_s, record| (!(5000.035..8600.0).contains(&time_s)).then_some(record));
     assert_early_ticks_have_no_effect(&config, &records);
 }

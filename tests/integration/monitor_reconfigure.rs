@@ -1,5 +1,4 @@
-//! Tests a reload of the configuration while the core runs: what is applied, what continues unchanged, and what needs a
-//! restart.
+//! Tests a reload of the configuration while the core runs: what is applied, what continues, and what needs a restart.
 
 use crate::support::rig::{Rig, learned, load};
 use packwatch::alarm::{AlarmState, Change, Rule, Severity};
@@ -26,7 +25,6 @@ impl Rig {
     }
 }
 
-/// A hot pack with a raised and acknowledged alarm.
 fn hot() -> Rig {
     let mut rig = Rig::new(HOT);
     rig.heat(60.0, 2);
@@ -73,7 +71,7 @@ fn changed_threshold_restarts_debounce() {
     assert_eq!(rig.changes(Rule::TemperatureHigh), []);
     rig.heat(60.0, 2);
     assert_eq!(rig.changes(Rule::TemperatureHigh), [Change::Raised]);
-    // With an unchanged threshold the debounce continues.
+    // If the threshold is unchanged, the debounce continues.
     let mut rig = Rig::new(&(HOT.to_owned() + "debounce_s = 10\n"));
     rig.heat(60.0, 9);
     rig.reload(|config| config.sample.ambient_c += 1.0).unwrap();
@@ -90,7 +88,7 @@ fn removed_rule_ends_its_alarm() {
     let wire = rig.last_wire(Rule::TemperatureHigh);
     assert_eq!((wire.state, wire.test), (6, false), "the alarm state is unknown");
     assert!(rig.events.iter().any(|event| event.kind == EventKind::Reconfigured { alarms_ended: 1 }));
-    // The reload does not affect the alarm of the rule's other severity.
+    // The reload must not affect the alarm of the rule's other severity.
     rig.heat(60.0, 1);
     assert_eq!(rig.changes(Rule::TemperatureHigh), [Change::Forgotten, Change::Raised]);
     assert_eq!(rig.state(Rule::TemperatureHigh, None), (AlarmState::Active, 1, false));
@@ -114,8 +112,8 @@ fn new_threshold_applies_to_learned_values() {
 fn changed_end_of_life_discards_old_forecast() {
     let mut rig = Rig::new("[[alarm]]\nrule = \"remaining_life_low\"\nwarning = 30\n");
     rig.seconds(2);
-    // The capacity is 2.36 Ah and falls by 0.004 Ah per cycle. The forecast expects a faster fade later: about
-    // 60 cycles to 2.08 Ah and about 90 to 1.82 Ah.
+    // The forecast expects that the fade becomes faster. It predicts about 60 cycles to 2.08 Ah and about 90 cycles to
+    // 1.82 Ah.
     let mut forecast = Forecast::new(Axis::Cycles, 2.6);
     for cycle in 0..60 {
         let passed = Usage { cycles: 1.0, days: 0.5, rest_days: 0.0 };
@@ -192,7 +190,7 @@ fn reload_keeps_command_sequence() {
     let mut rig = learned();
     rig.command(1, 31, 2047);
     rig.reload(|config| config.rules[0].threshold = 4.9).unwrap();
-    // A counter check that had been reset would treat this frame as the first one and ignore the command.
+    // If the reload had reset the counter check, this frame would count as the first one and be ignored.
     rig.command(1, 31, 2047);
     assert!(rig.events.iter().any(|event| matches!(event.kind, EventKind::Command { changed: 2, .. })));
 }
@@ -247,7 +245,7 @@ fn reload_keeps_address_and_changes_codes() {
     assert_eq!(spn(&rig), 7001);
     let claims = |rig: &Rig| rig.frames.iter().filter(|frame| frame.id() == CanId::Extended(0x18EE_FFF9)).count();
     assert_eq!(claims(&rig), 0);
-    // A new NAME must claim its own address.
+    // If the NAME changes, the node must claim an address again.
     rig.reload(|config| {
         let other = j1939.replace("number = 1", "number = 2");
         config.j1939 = load(&(HOT.to_owned() + &other)).monitor.j1939;

@@ -1,4 +1,4 @@
-//! Tests the effects of a restart and of sleep on estimates and alarms, with hand-made frames of a two-cell pack.
+//! Tests the effects of a restart and of sleep on estimates and alarms.
 
 use crate::support::rig::{Rig, learned};
 use packwatch::alarm::{AlarmState, Change, Rule, Selector};
@@ -21,7 +21,7 @@ impl Rig {
 fn unknown_downtime_keeps_only_learned_values() {
     let mut rig = learned();
     let (capacity, before) = (rig.monitor.capacity(CellIndex(1)), rig.soc_std(0));
-    // No current is measured, so only the gap has an effect.
+    // No current is measured, so only the downtime has an effect.
     rig.current_a = None;
     rig.restart(Downtime::Unknown);
     rig.seconds(1);
@@ -38,7 +38,7 @@ fn state_from_future_has_unknown_age() {
     rig.seconds(1);
     assert_eq!(rig.gaps(), [None]);
     assert!(rig.soc_std(0) > 0.25, "{}", rig.soc_std(0));
-    // Frames of several interfaces may arrive slightly out of order. This does not mean that the clock was set back.
+    // Frames of several interfaces may arrive slightly out of order. The clock was not set back.
     let mut rig = learned();
     (rig.current_a, rig.deci) = (None, rig.deci - 5);
     rig.restart(Downtime::AsStamped);
@@ -47,14 +47,14 @@ fn state_from_future_has_unknown_age() {
     assert!(rig.soc_std(0) < 0.05, "{}", rig.soc_std(0));
 }
 
-/// Learned values as stored: capacities with their drift terms, and the filters' resistances.
+/// Stored learned values: capacities with their drift terms, and the filters' resistances.
 fn learned_parts(rig: &Rig) -> Vec<serde_json::Value> {
     let document = serde_json::to_value(rig.monitor.snapshot()).unwrap();
     let learner = &document["learning"]["learner"];
     let mut parts = vec![learner["capacity"].clone(), learner["drift"].clone(), learner["learned"].clone()];
     for cell in document["cells"].as_array().unwrap() {
         let mean = cell["estimator"]["mean"].as_array().unwrap();
-        // The filter's mean ends with resistance ratio and capacity, after SOC and branches.
+        // The filter's mean contains SOC, branches, resistance ratio and capacity, in this order.
         parts.push(mean[mean.len() - 2].clone());
         parts.extend([cell["usable"].clone(), cell["discharge_resistance"].clone()]);
     }
@@ -103,7 +103,6 @@ impl Rig {
     }
 }
 
-/// All kinds of downtime.
 const AWAYS: [Downtime; 5] = [
     Downtime::Seconds(0.0),
     Downtime::Seconds(2.0),
@@ -257,7 +256,7 @@ fn low_soc_is_not_judged_by_old_value() {
         } else {
             rig.deci += 360_000;
         }
-        // The pack was charged during the sleep. At first only voltages are received, which leave the SOC ambiguous.
+        // The pack was charged during the sleep. At first only voltages are received, so the SOC is ambiguous.
         (rig.voltages_v, rig.current_a) = ([Some(4.0); 2], None);
         rig.seconds(1);
         assert_eq!(rig.stands(Rule::SocLow), (AlarmState::Suppressed, 1, false), "{restarted} {away_s}");
@@ -266,7 +265,8 @@ fn low_soc_is_not_judged_by_old_value() {
             rig.seconds(1);
             let heard = rig.changes(Rule::SocLow);
             assert_eq!((heard[1], heard.last()), (Change::Suppressed, Some(&Change::Cleared)));
-            // After a sleep the filter is more certain than after downtime, so it corrects the old SOC slightly later.
+            // After a sleep the filter is more certain than after a downtime, so it corrects the old SOC slightly
+            // later.
             assert!(!restarted || heard.len() == 3, "{heard:?}");
         }
     }
@@ -290,7 +290,7 @@ fn untrusted_estimate_is_suppressed_once() {
         "[[alarm]]\nrule = \"estimate_untrusted\"\nwarning = 4\n[estimator]\nlost_after_s = 1e6\ngate_sigma = 1e3\n",
     );
     rig.seconds(30);
-    // Let the first cell's voltage jump although no current flows.
+    // The first cell's voltage jumps although no current flows.
     rig.voltages_v = [Some(3.0), Some(3.7)];
     rig.seconds(2);
     for _ in 0..200 {
@@ -385,7 +385,6 @@ fn trouble_codes_wait_for_address_after_restart() {
 
 const IDENTITY: &str = "[input.pack_identity]\nsignal = \"Cells.Serial\"\nreadings = 5\naccept_unprotected = true\n";
 
-/// Identities of all connected packs, and the number of pack changes.
 fn packs(rig: &Rig) -> (Vec<f64>, usize) {
     let of = |kind| if let EventKind::PackIdentity { identity } = kind { Some(identity) } else { None };
     let replaced = rig.events.iter().filter(|event| matches!(event.kind, EventKind::PackReplaced { .. })).count();
@@ -426,7 +425,7 @@ fn changed_identity_means_new_pack() {
 
 #[test]
 fn restart_begins_with_used_up_budget_of_alarm_frames() {
-    // Time since the budget was used up (s). After 0.2 s, a burst is allowed.
+    // Time since the budget of alarm frames was used up (s). If it exceeds 0.2 s, a burst is allowed.
     let unused_s = |away| {
         let mut rig = Rig::new("");
         rig.seconds(20);
@@ -439,6 +438,6 @@ fn restart_begins_with_used_up_budget_of_alarm_frames() {
     for away in [Downtime::Unknown, Downtime::Seconds(5.0)] {
         assert!(unused_s(away) < 0.001, "{away:?}: {} s", unused_s(away));
     }
-    // No time has passed, so the state is that of the end.
+    // Without downtime, the budget is the one before the restart.
     assert!(unused_s(Downtime::Seconds(0.0)) > 10.0, "{}", unused_s(Downtime::Seconds(0.0)));
 }

@@ -1,5 +1,5 @@
-//! Tests regression scenarios with hand-made frames of one measured cell. In each, an earlier version published a false
-//! value, lost a value, or flickered.
+//! Regression scenarios of one measured cell. In each, an earlier version published a false value, lost a value, or
+//! flickered.
 
 use std::path::Path;
 
@@ -82,7 +82,7 @@ impl Bench {
         }
         self.take();
     }
-    /// Runs `seconds` at current `i` with one sample per second and a tick every 0.1 s.
+    /// Runs `seconds` at current `i`, with one sample per second and a tick every 0.1 s.
     fn run(&mut self, i: f64, seconds: u32) {
         for _ in 0..seconds {
             self.second(i, true, true);
@@ -202,7 +202,7 @@ fn stop_and_go_drive_gives_half_cycle() {
 fn lost_voltage_makes_soc_uncertain() {
     let mut b = Bench::new(load("paper.toml"), 0.9);
     b.run(2.6, 300);
-    // Voltage and temperature share a message here, so send the current with the voltage as "not available".
+    // Voltage and temperature share a message, so mark only the voltage as "not available".
     for _ in 0..1800 {
         b.second(2.6, true, false);
     }
@@ -295,7 +295,7 @@ fn jumping_voltage_is_not_trusted() {
     assert!(valid < 600, "SOC valid for {valid} of 3600 s");
     assert!(b.count(|k| alarm(k, Rule::EstimateUntrusted, true)) > 0);
 
-    // Load steps end the doubt about the current.
+    // Load steps confirm the current again.
     b.voltage_error = 0.0;
     for _ in 0..90 {
         b.run(1.3, 20);
@@ -304,7 +304,7 @@ fn jumping_voltage_is_not_trusted() {
     assert!(b.count(|k| matches!(k, EventKind::Trust { trusted: true, .. })) > 0);
 }
 
-/// A drive with steps of the load, then 14 hours without any frame.
+/// A drive with load steps, then 14 hours without any frame.
 fn drive_and_sleep() -> Bench {
     let mut b = Bench::new(load("paper.toml"), 0.8);
     for _ in 0..10 {
@@ -348,7 +348,7 @@ fn soc_jump_is_not_a_recharge_period() {
     c.rules = vec![rule(Rule::RechargePeriodLow, 1500.0, 0.0)];
     let mut b = Bench::new(c, 0.2);
     b.run(-1.3, 60);
-    // Let the true SOC jump to 0.88 during a charge, as after a sleep or with wrong wiring. The filter then restarts.
+    // The true SOC jumps to 0.88 during a charge, as after a sleep or with wrong wiring. The filter then restarts.
     b.soc = 0.88;
     b.run(-1.3, 200);
 
@@ -392,7 +392,7 @@ fn half_cycle_after_gap_has_large_deviation() {
     let mut b = Bench::new(c, 0.95);
     b.run(0.0, 60);
     b.run(2.0, 900);
-    // Without measurement the cell discharges to 30 %.
+    // The cell discharges to 30 % while no frames are received.
     b.t += 3600.0;
     b.monitor.handle(&Record::unknown_gap(Timestamp::from_secs(b.t)), &mut b.out);
     (b.soc, b.u1) = (0.3, 0.0);
@@ -468,7 +468,7 @@ fn half_cycle_ending_after_restart_is_learned() {
     b.run(2.0, 900);
     b.run(0.0, 9);
     b.restart(5.0);
-    b.tick(); // housekeeping confirms the mode before the first voltage
+    b.tick(); // the tick confirms the mode before the first voltage
     b.run(0.0, 30);
 
     assert_eq!(b.count(|k| matches!(k, EventKind::HalfCycle { .. })), 1);
@@ -502,7 +502,7 @@ fn ticks_continue_after_clock_step_back() {
 #[test]
 fn first_half_cycle_has_correct_swing() {
     let mut b = Bench::new(load("paper.toml"), 0.9);
-    b.run(2.6, 720); // 20 %
+    b.run(2.6, 720); // moves 20 % of the capacity
     b.run(0.0, 60);
     for e in &b.events {
         if let EventKind::HalfCycle { swing, .. } = e.kind {
@@ -580,7 +580,7 @@ fn state_restored_on_earlier_clock_keeps_sending() {
         let time = Timestamp::from_secs(-1e6).plus_nanos(tick * 10_000_000);
         monitor.handle(&Record::tick(time), &mut out);
     }
-    // Each of the three seconds gives a status frame, five health pages and four digest pages. The state may have been
-    // taken anywhere in the period.
+    // Each of the three seconds gives a status frame, five health pages and four digest pages. The stored state may
+    // date from any time within the period.
     assert!((21..=36).contains(&out.frames.len()), "{} frames", out.frames.len());
 }

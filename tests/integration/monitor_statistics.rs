@@ -1,4 +1,4 @@
-//! Tests the core's counters and the values that it shows, with hand-made frames of a two-cell pack.
+//! Tests the core's counters and the values that it shows.
 
 use crate::support::rig::{Rig, learned};
 use packwatch::monitor::{BusStatistics, CellView, Downtime, Statistics, Validity};
@@ -9,7 +9,7 @@ use packwatch::quantity::{CellIndex, Mode};
 fn readings_are_counted_by_outcome() {
     let mut rig = Rig::new("");
     rig.seconds(10);
-    // 200 frames: 100 with four bound signals, 100 with two.
+    // 100 frames with four configured signals each, and 100 frames with two.
     let before = rig.monitor.reading_counts();
     assert_eq!((before.accepted, before.out_of_range), (600, 0));
     assert_eq!(rig.monitor.statistics().buses[0].frames, 200);
@@ -42,7 +42,6 @@ fn counts_continue_after_restart() {
     assert_eq!(after.gaps, before.gaps + 1);
     assert_eq!(after.buses[0].frames, before.buses[0].frames + 20);
     assert!(rig.monitor.reading_counts().accepted > readings.accepted);
-    // The difference contains only the counts since `before`.
     let added = after.since(&before);
     assert_eq!((added.learning.half_cycles, added.restores, added.gaps, added.buses[0].frames), (0, 1, 1, 20));
     assert_eq!(rig.monitor.reading_counts().since(&readings).accepted, 60);
@@ -54,7 +53,7 @@ fn bad_commands_are_counted_and_reports_limited() {
     let mut rig = Rig::new("");
     rig.seconds(1);
     for _ in 0..5 {
-        // Command code 0 and rule number 30 do not exist, so the command is bad.
+        // Command code 0 and rule number 30 do not exist.
         rig.command(0, 30, 0x7FF);
     }
     let reported = rig.events.iter().filter(|event| format!("{event:?}").contains("BadCommand")).count();
@@ -69,7 +68,7 @@ fn stale_values_are_not_shown() {
     let voltage_v = pack.values.mean(Quantity::Voltage).unwrap();
     assert!((voltage_v - rig.voltages_v.iter().flatten().sum::<f64>()).abs() < 1e-3, "{voltage_v}");
     assert!(pack.weakest_cell.is_some() && pack.values.mean(Quantity::Soh).is_some_and(|soh| soh > 0.0));
-    // One cell is silent: only its learned values are shown. Pack values that depend on the cell are not shown.
+    // One cell is silent. Pack values that depend on it are not shown.
     rig.voltages_v[1] = None;
     rig.seconds(20);
     let cells: Vec<_> = rig.monitor.cell_views().collect();

@@ -1,7 +1,7 @@
-//! Tests that the monitor learns the model of a cell from simulated drives and charges. Only the cell's label is known.
+//! Tests that the monitor learns a cell model from simulated drives and charges if only the cell's label is known.
 //!
-//! The cell has less capacity than its label says, and not the usual resistances of its chemistry. It runs cycles of
-//! the paper's scenario, with a night between cycles.
+//! The cell's capacity is below the label's, and its resistances are not typical of its chemistry. The cell runs cycles
+//! of the scenario `paper`, with a night between cycles.
 
 use std::path::Path;
 
@@ -17,7 +17,6 @@ use packwatch::monitor::{Downtime, Event, EventKind, ModelState, Monitor, Monito
 use packwatch::quantity::{BusIndex, CellIndex, Channel, Timestamp};
 use packwatch::sim::{Scenario, Settings, Simulation, Wiring};
 
-/// Label capacity and true capacity.
 const RATED_AH: f64 = 5.0;
 const TRUE_AH: f64 = 4.7;
 const TRUE_RESISTANCE: f64 = 0.7;
@@ -30,12 +29,11 @@ fn configuration(chemistry: &str) -> MonitorConfig {
     configuration_with(chemistry, "")
 }
 
-/// The monitor's configuration; `more` contains further tables.
 fn configuration_with(chemistry: &str, more: &str) -> MonitorConfig {
     configuration_from(chemistry, more, None)
 }
 
-/// Like [`configuration_with`], with the text of a fleet's prior.
+/// Like [`configuration_with`], with a fleet's prior (`fleet` is the text of its file).
 fn configuration_from(chemistry: &str, more: &str, fleet: Option<&str>) -> MonitorConfig {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
     let text = std::fs::read_to_string(folder.join("score.toml")).unwrap();
@@ -53,7 +51,6 @@ fn configuration_from(chemistry: &str, more: &str, fleet: Option<&str>) -> Monit
         .monitor
 }
 
-/// The true cell: the label's chemistry with other resistances.
 fn true_model(config: &MonitorConfig) -> CellModel {
     let scaled = |table: &Table, factor: f64| Table {
         values: table.values.iter().map(|row| row.iter().map(|value| factor * value).collect()).collect(),
@@ -68,9 +65,8 @@ fn true_model(config: &MonitorConfig) -> CellModel {
     model
 }
 
-/// SOC ranges of deep cycles.
 const DEEP: [(f64, f64); 1] = [(0.08, 0.97)];
-/// SOC ranges of partial cycles. Each cycle moves 60 % of the capacity, and every third cycle charges until full.
+/// SOC ranges of partial cycles. Each cycle moves 60 % of the capacity. Every third cycle charges until full.
 const PARTIAL: [(f64, f64); 3] = [(0.4, 1.0), (0.1, 0.7), (0.25, 0.85)];
 
 /// Frames of some cycles of a cell with the given capacity (Ah), in time order. The SOC ranges are used in turn.
@@ -122,7 +118,6 @@ fn with_rests(
     all
 }
 
-/// A monitor and all its events.
 struct Live {
     monitor: Monitor,
     out: Outputs,
@@ -153,7 +148,7 @@ impl Live {
         self.monitor.handle(&record, &mut self.out);
         self.said.extend(self.out.frames.iter().map(|frame| format!("{frame:?}")));
         self.said.extend(self.out.estimates.iter().map(|estimate| format!("{estimate:?}")));
-        // The energy depends on the average load, which lacks the time of a restart.
+        // Skip outlooks. Their energy depends on the average load, which differs after a restart.
         let is_exact = |event: &&Event| !matches!(event.kind, EventKind::Outlook { .. });
         self.said.extend(self.out.events.iter().filter(is_exact).map(|event| format!("{event:?}")));
         self.events.append(&mut self.out.events);
@@ -231,8 +226,7 @@ fn restored_state_continues_learning_unchanged() {
     let mut whole = Live::new(&config);
     let (mut twin, mut from): (Option<Live>, usize) = (None, 0);
     for (at, frame) in frames.iter().enumerate() {
-        // Restore a twin from a stored state seven times. Compare each twin with the uninterrupted monitor until the
-        // next twin replaces it.
+        // Seven times, restore a twin from a stored state and compare it with the uninterrupted monitor.
         if at % (frames.len() / 7) == frames.len() / 14 {
             twin = Some(Live::restored(&config, whole.monitor.snapshot()));
             from = whole.said.len();
@@ -323,7 +317,7 @@ fn corrected_label_keeps_rows_and_discards_model() {
     assert!(matches!(view.state, ModelState::Learning | ModelState::Learned), "{:?}", view.state);
 }
 
-/// A prior of ten equal vehicles with twice the resistance of the label's model.
+/// The prior of ten equal vehicles whose resistance is twice that of the label's model.
 fn resistive_prior(label: &Label) -> FleetPrior {
     let of_label = label.prior().unwrap();
     let (modes_v, rest_v) = of_label.curve.modes_v();
@@ -364,7 +358,7 @@ fn prior_given_later_replaces_stored_resistance() {
         live.monitor.latest().next().flatten().unwrap()
     });
     assert!((kept.capacity_ah - last.capacity_ah).abs() < 0.05, "{kept:?}");
-    // The resistance was learned relative to the label's model, and the prior knows the capacity better.
+    // The stored resistance refers to the label's model, so it is discarded. The prior's capacity is more certain.
     assert!((changed.resistance_ratio - 1.0).abs() < 0.01, "relative to the prior: {changed:?}");
     assert!(changed.resistance_ratio_std > kept.resistance_ratio_std, "{kept:?} {changed:?}");
     assert!((changed.capacity_ah - fleet.mean.capacity.mean).abs() < 0.05, "{changed:?}");
@@ -391,7 +385,6 @@ fn vehicle_starts_from_what_a_fleet_has_learned() {
     let ohm = |model: &CellModel| model.settled_ohm(&model.grid_position(0.5, 25.0));
     assert!((ohm(&model) / ohm(&truth) - 1.0).abs() < 0.1 * ohm(&config.model) / ohm(&truth));
 
-    // The configuration reads the file of the fleet.
     let text = toml::to_string(&fleet).unwrap();
     let prior = configuration_from("nmc811-graphite", "", Some(&text));
     assert_eq!(prior.fleet.as_ref(), Some(&fleet));
@@ -401,12 +394,12 @@ fn vehicle_starts_from_what_a_fleet_has_learned() {
         let mut live = Live::new(config);
         frames.iter().for_each(|frame| live.take(frame));
         let last = live.monitor.latest().next().flatten().unwrap();
-        // The cell ends its cycle at the upper end of its range.
+        // The cycle ends at the upper end of its SOC range.
         (last.soc - 0.85, last.soc_std)
     });
     let [(_, label_std), (off, std)] = errors;
     assert!(std < 0.8 * label_std && off.abs() < 1.96 * std, "{errors:?}");
-    // The vehicle's own fit starts from the fleet, too.
+    // The vehicle's own fit also starts from the fleet's prior.
     let own = [&config, &prior].map(|config| {
         let mut live = Live::new(config);
         vehicle(&truth, config, TRUE_AH, &swings, 3).iter().for_each(|frame| live.take(frame));

@@ -1,6 +1,6 @@
-//! Replays a measured drive with the model of another cell: the estimate must become untrusted within half an hour.
+//! Replays a measured drive with the model of another cell. The estimate must become untrusted within half an hour.
 //!
-//! Panasonic 18650PF and LG HG2 are both 18650 cells of nearly 3 Ah; each drive runs with both models.
+//! Panasonic 18650PF and LG HG2 are both 18650 cells of nearly 3 Ah. Each drive runs with both models.
 
 use std::path::Path;
 use std::process::Command;
@@ -13,7 +13,7 @@ fn run(arguments: &[&str]) {
     assert!(output.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
 }
 
-/// Fits a model of the cell in `folder` on its slow discharge and some of its drives at 25 degrees C.
+/// Fits a model of the cell in `folder` to its slow discharge and some of its drives at 25 degrees C.
 fn fit(folder: &Path, capacity_ah: &str, slow: &str, drives: &[&str], model: &Path) {
     let path = |name: &str| folder.join("25C").join(format!("{name}.csv.gz")).display().to_string();
     let (model, slow) = (model.display().to_string(), path(slow));
@@ -23,7 +23,7 @@ fn fit(folder: &Path, capacity_ah: &str, slow: &str, drives: &[&str], model: &Pa
     run(&arguments);
 }
 
-/// Time (s) from the first row until the estimate first became untrusted; `None` = never.
+/// Time (s) from the first row until the estimate first becomes untrusted. `None` if it never does.
 fn first_untrusted_s(folder: &Path, model: &Path, drive: &Path) -> Option<f64> {
     let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
     let text = std::fs::read_to_string(shipped.join("score.toml")).unwrap();

@@ -1,5 +1,4 @@
-//! Compares energy, time and power with measured drives, charges and pulses. The cell models are fitted to other files of
-//! the same cells, or to the first cycles.
+//! Compares the predicted energy, time and power with measured drives, charges and pulses.
 
 use std::path::{Path, PathBuf};
 
@@ -12,7 +11,7 @@ use packwatch::replay::MonitorDriver;
 
 use crate::support::measured;
 
-/// A row of a measured file: cycle, time (s), current (A), voltage (V), and the pack at some of the rows.
+/// A row of a measured file. Some rows also have the monitor's pack view.
 struct Row {
     cycle: u32,
     time_s: f64,
@@ -35,7 +34,7 @@ fn fit(folder: &Path, args: &[&str]) -> PathBuf {
     model
 }
 
-/// Feeds a file to a monitor with the model. `every_s`: time between two views of the pack.
+/// Feeds a file to a monitor with the given model. `every_s`: time between two pack views (s).
 fn run(model: &Path, more: &str, file: &str, cycles: u32, every_s: f64) -> Vec<Row> {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
     let text = std::fs::read_to_string(root.join("score.toml")).unwrap();
@@ -101,7 +100,7 @@ fn remaining_energy_agrees_with_measured_drives() {
     let mut args = vec!["--capacity", "2.781"];
     args.extend(slow.iter().flat_map(|file| ["--ocv", file]).chain(drives.iter().map(String::as_str)));
     let model = fit(folder.path(), &args);
-    // (drive, largest RMS error as a share of the full energy)
+    // Drive, and largest RMS error as a fraction of the full energy.
     for (drive, most) in [("25C/552_Mixed8", 0.05), ("10C/571_Mixed8", 0.07), ("0C/590_Mixed8", 0.08)] {
         let rows = run(&model, "", &lg(drive), 1, 60.0);
         let end = rows.iter().rposition(|row| row.current_a.abs() > 0.05).unwrap();
@@ -130,7 +129,7 @@ fn time_to_full_agrees_with_measured_charges() {
     let rows = run(&model, "", "nasa_pcoe_aging/B0006.csv.gz", 30, 30.0);
     let (mut errors, mut inside) = (Vec::new(), Vec::new());
     for charge in rows.chunk_by(|a, b| a.cycle == b.cycle) {
-        // The charge is complete at C/20, which is the default.
+        // By default a charge is complete when the current falls to C/20.
         let is_held = |row: &&Row| row.voltage_v > 4.18 && -row.current_a > 0.1;
         let Some(end) = charge.iter().rposition(|row| is_held(&row)).filter(|end| end + 1 < charge.len()) else {
             continue;
@@ -169,7 +168,7 @@ fn power_agrees_with_measured_pulses() {
             let (Some(it), Some(end), true) = (latest, end, begins) else { continue };
             let resistance_ohm = (pair[0].voltage_v - end.voltage_v) / end.current_a;
             let limit_a = (pair[0].voltage_v - 2.8) / resistance_ohm;
-            // Only pulses near the limit show the resistance there.
+            // Only pulses near the current limit show the resistance at the limit.
             if end.current_a > 0.35 * limit_a {
                 errors.push((it.mean / (2.8 * limit_a) - 1.0).abs());
                 kept.push(it.mean - 1.645 * it.std.unwrap() <= 2.8 * limit_a);

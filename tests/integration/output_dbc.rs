@@ -1,6 +1,5 @@
-//! Checks that `cantools` loads the written DBC in strict mode, and that every sent frame decodes to the original
-//! values within half a step of each signal. The test covers every sent message, every protection profile, standard and
-//! extended identifiers, classic and FD frames, and two rated capacities.
+//! Checks the written DBC: `cantools` must load it in strict mode, and every sent frame must decode to the original
+//! values within half a step of each signal.
 
 use std::collections::{BTreeSet, HashMap};
 use std::path::Path;
@@ -58,11 +57,9 @@ const HEALTH_PAGES: [&str; 13] = [
     "charge_powers",
 ];
 
-/// Frames per message and configuration.
 const FRAMES: usize = 40;
 
-/// Rules in the order of their numbers. Each row: name, factor from the internal unit to the unit in the frame, and
-/// largest tested value.
+/// Name, factor from the internal unit to the frame's unit, and largest tested value, in the order of the rule numbers.
 const RULES: [(&str, f64, f64); 18] = [
     ("CapacityLow", 1.0, 5.0),
     ("UsableCapacityLow", 1.0, 5.0),
@@ -98,7 +95,6 @@ const REFUSALS: [CommandRefusal; 8] = [
     CommandRefusal::RepeatNeeded,
 ];
 
-/// A configuration of the test matrix.
 #[derive(Debug, Clone, Copy)]
 struct Case {
     fd: bool,
@@ -171,13 +167,12 @@ impl Maker {
         self.random.next_u32() % count
     }
 
-    /// Half the step of a signal in the layout. With this tolerance the test checks the resolution that the layout
-    /// promises.
+    /// Half a step of a signal in the layout, so that the test checks the promised resolution.
     fn half_step(&self, name: &str) -> f64 {
         self.database.signal(name).unwrap().1.layout.factor / 2.0
     }
 
-    /// A random threshold of a rule, and the value a receiver must read.
+    /// A random threshold of a rule, and the value that a receiver must read.
     fn threshold(&mut self, number: usize) -> (ThresholdFields, f64) {
         let (_, scale, largest) = RULES[number - 1];
         let (threshold, severity) = (self.below(largest), 1 + self.one_of(3));
@@ -355,7 +350,7 @@ impl Maker {
             2 => {
                 let (rule, severity) = (f64::from(threshold.rule), f64::from(threshold.severity));
                 let mut wanted = self.wanted("Digest", &[("ThresholdRule", rule), ("ThresholdSeverity", severity)]);
-                // Not rounded: the only error is the resolution of a 32-bit float.
+                // The threshold is not rounded, so its only error is the resolution of a 32-bit float.
                 wanted.push(("Threshold".to_owned(), threshold_read, threshold_read * f64::from(f32::EPSILON)));
                 wanted
             }
@@ -371,7 +366,7 @@ impl Maker {
         (self.plan.digest(page, &fields, &mut self.counters).unwrap(), wanted)
     }
 
-    /// Makes the reply to an executed, a rejected or an unreadable command, in turn.
+    /// The reply to an executed, a rejected or an unreadable command, in turn.
     fn reply(&mut self, turn: usize) -> (Frame, Wanted) {
         const KINDS: [Command; 3] = [Command::Acknowledge, Command::Clear, Command::PackReplaced];
         let (kind, rule) = (turn % KINDS.len(), 1 + turn % RULES.len());
@@ -416,7 +411,7 @@ impl Maker {
     }
 }
 
-/// Checks that a receiver with the DBC reads the same protection header as packwatch's own check.
+/// Checks that a receiver with the DBC reads the same protection header as packwatch itself.
 fn check_header(case: Case, number: u16, frame: &Frame, read: &HashMap<String, f64>, expected: &mut [u8; 7]) {
     let Some(profile) = case.profile else {
         assert!(!read.contains_key("E2eCrc") && frame.data()[..2] == [0, 0], "{case:?}");
@@ -432,7 +427,7 @@ fn check_header(case: Case, number: u16, frame: &Frame, read: &HashMap<String, f
     }
 }
 
-/// `Message.Signal` of everything that is sent.
+/// `Message.Signal` of every sent signal.
 fn sent_signals(database: &Database) -> BTreeSet<String> {
     let sent = database.messages.iter().filter(|message| message.name != "PACKWATCH_Command");
     let signals = |message: &packwatch::can::dbc::Message| -> Vec<String> {
@@ -543,7 +538,7 @@ fn tested_rules_are_complete_and_ordered() {
     assert_eq!(RULES.map(|(name, ..)| name.to_owned()), Rule::ALL.map(|rule| camel_case(rule.name())));
 }
 
-/// Word for a refusal in the value table of `Reason`.
+/// Word for a refusal, as in the value table of `Reason`.
 const fn reason_word(refusal: CommandRefusal) -> &'static str {
     match refusal {
         CommandRefusal::FirstFrame => "first frame",
@@ -574,7 +569,6 @@ fn refusal_codes_match_dbc_value_table() {
     assert_eq!(words(&database, "PACKWATCH_Reply.Reason"), table);
 }
 
-/// The value table of a signal.
 fn words<'d>(database: &'d Database, signal: &str) -> Vec<(i64, &'d str)> {
     let table = &database.signal(signal).unwrap().1.values;
     table.iter().map(|(code, word)| (*code, word.as_str())).collect()
@@ -610,11 +604,11 @@ fn contract_table() -> impl Iterator<Item = Vec<&'static str>> {
     rows.map(|line| line.split('|').map(str::trim).collect())
 }
 
-/// Compares with the manual's contract page: `/docs/src/ecu/contract.md`, "Messages" and "Budget".
+/// Compares with the manual's page `docs/src/ecu/contract.md`, sections "Messages" and "Budget".
 #[test]
 fn dbc_timing_matches_contract_page() {
     let base = LayoutBase::BuiltIn { rated_capacity_ah: 2.6 };
-    // Replies are sent if commands are accepted, freshness values if commands are authenticated.
+    // Replies are sent if commands are accepted. Freshness values are sent if commands are authenticated.
     let secoc = |profile, data_id| Some(Authentication { profile, data_id });
     let command = MessageSettings { secoc: secoc(secoc::Profile::P1, 1), ..MessageSettings::default() };
     let freshness = MessageSettings { secoc: secoc(secoc::Profile::Announcement, 2), ..MessageSettings::default() };
@@ -648,7 +642,7 @@ fn dbc_timing_matches_contract_page() {
         assert!(first_ms(&timeout) == three_periods || ["Alarm", "Reply"].contains(name), "{name}: {timeout}");
     }
     let pass_time = &database.signal("PACKWATCH_Digest.PassTime").unwrap().1.layout;
-    // The last code is "not available", and each alarm takes 20 ms.
+    // The highest code means "not available". Each alarm takes 20 ms.
     let longest_s = f64::from((1_u32 << pass_time.length_bits) - 2) * pass_time.factor;
     let ends =
         format!("`PassTime` ends at {longest_s:.1} s, the pass of 10,{:03.0} raised", longest_s / 0.02 - 10_000.0);

@@ -1,5 +1,4 @@
-//! Learned values belong to a pack's identity number. When the pack is connected again, its values are restored, even
-//! after other packs and restarts.
+//! Tests that learned values belong to a pack's identity number, and are restored when the pack is connected again.
 
 use packwatch::alarm::{Change, Rule};
 use packwatch::monitor::{CellView, Command, Downtime, EventKind, Record};
@@ -29,7 +28,7 @@ fn learned(rig: &Rig) -> Vec<String> {
     rig.monitor.cell_views().map(cell).collect()
 }
 
-/// Feeds one more round of voltages, which changes the resistances slightly. Returns the resistances relative to new.
+/// Feeds one more round of voltages. Returns the resistances relative to a new cell.
 fn resistances(rig: &mut Rig) -> Vec<f64> {
     rig.tick_with_frames();
     rig.monitor.cell_views().map(|view| view.values.mean(Quantity::ResistanceRatio).unwrap()).collect()
@@ -128,7 +127,7 @@ fn least_recently_connected_pack_is_evicted() {
         rig.voltages_v = [Some(3.65); 2];
         rig.discharge();
     }
-    // The monitor keeps A and seven others in addition to the connected pack. A ninth pack would exceed that limit.
+    // In addition to the connected pack, the monitor keeps eight packs. A ninth pack would exceed this limit.
     let snapshot = serde_json::to_value(rig.monitor.snapshot()).unwrap();
     let numbers = |value: &serde_json::Value| {
         value["packs"]["packs"]
@@ -140,7 +139,7 @@ fn least_recently_connected_pack_is_evicted() {
     };
     assert_eq!(numbers(&snapshot), [A, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0]);
     let bytes = serde_json::to_string(&snapshot["packs"]).unwrap().len();
-    // A cell takes 2.6 kB; the rest belongs to the pack, which here has only two cells.
+    // A cell takes 2.6 kB. The limit also allows for the data of the pack, which has only two cells here.
     assert!(bytes < 8 * 2 * 4200, "{bytes} bytes for 16 cells");
     connect(&mut rig, 9.0);
     connect(&mut rig, A);

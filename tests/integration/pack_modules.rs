@@ -1,4 +1,4 @@
-//! Tests a pack whose two cells are of different kinds, as configured by `[[pack.module]]`.
+//! Tests a pack with two kinds of cells (`[[pack.module]]`).
 
 use packwatch::cell::CellModel;
 use packwatch::monitor::Downtime;
@@ -9,14 +9,13 @@ use crate::support::rig::{DBC, PACK, Rig};
 
 const MODULE: &str = "[[pack.module]]\ncells = \"2\"\nchemistry = \"lfp-graphite\"\nrated_capacity_ah = 2.6\n";
 
-/// A cell that follows the model, discharged at 25 degrees C.
+/// A cell that follows the model at 25 degrees C.
 struct Truth<'a> {
     model: &'a CellModel,
     branches_v: Vec<f64>,
 }
 
 impl Truth<'_> {
-    /// The cell's voltage after `seconds` at this current (V).
     fn after(&mut self, seconds: f64, soc: f64, current_a: f64) -> f64 {
         let position = self.model.grid_position(soc, 25.0);
         for (i, branch_v) in self.branches_v.iter_mut().enumerate() {
@@ -28,7 +27,7 @@ impl Truth<'_> {
     }
 }
 
-/// Discharges from 95 to 15 % at half the capacity per hour, after a rest.
+/// Discharges from 95 to 15 % SOC at C/2, after a rest.
 fn discharge(rig: &mut Rig, models: [&CellModel; 2]) {
     let (capacity_ah, current_a, period_s) = (2.6, 1.3, 5);
     let mut cells = models.map(|model| Truth { model, branches_v: vec![0.0; model.branches.len()] });
@@ -59,7 +58,7 @@ fn each_cell_kind_uses_its_own_model() {
     let [own, module] = socs(&mixed);
     assert!((own.0 - 0.15).abs() < 0.02, "{own:?}");
     assert!((module.0 - 0.15).abs() < 1.96 * module.1, "{module:?}");
-    // Without the `[[pack.module]]` table, the second cell is treated as one of the pack's own kind.
+    // Without the `[[pack.module]]` table, the second cell is treated like the first.
     let mut alone = Rig::with(config_texts::load(PACK, DBC).monitor);
     discharge(&mut alone, models);
     let [own_alone, taken] = socs(&alone);
@@ -85,7 +84,7 @@ fn new_module_starts_fresh_others_continue() {
     let [own, old] = [0, 1].map(|cell| before.monitor.capacity(CellIndex(cell)));
     assert!(own.std() < 0.25 && old.std() < 0.25, "both learned: {own:?} {old:?}");
     let snapshot = before.monitor.snapshot();
-    // The second cell now has other RC branches and another capacity.
+    // In this configuration the second cell has other RC branches and another capacity.
     let text = format!("{PACK}{MODULE}initial_capacity_ah = 2.4\ninitial_capacity_std_ah = 0.5\n");
     let mut rig = Rig::with(config_texts::load(&text, DBC).monitor);
     assert_ne!(rig.config.model.branches.len(), rig.config.modules[0].model.branches.len());

@@ -1,11 +1,12 @@
-//! Runs the paper's scenario through the whole core (true cell -> sensors -> frames of the DBC -> Monitor) and judges
-//! the errors of each cycle.
+//! Runs the scenario of "Battery Predictions for Electronic Prognostics" through the whole core (true cell, sensors,
+//! frames of the DBC, Monitor). Checks the errors of each cycle.
 //!
 //! A cell of 2.6 Ah is cycled between SOC 0.3 and 0.9 with 1 s samples. It fades by 0.05 Ah per cycle to 0.25 Ah.
-//! Sensor errors: voltage noise 5 mV; current noise 20 mA, offset 10 mA, gain error 0.5 %. The paper's figures show
+//! Sensor errors: voltage noise 5 mV; current noise 20 mA, offset 10 mA, gain error 0.5 %. The paper's figures show an
 //! |SOC error| of 1 to 5 % during life and about 20 % at the end. The capacity in these figures lags by one event and
-//! falls to 2.2 Ah at the first event. To print the table: `cargo test --workspace --test integration paper_scenario --
-//! --nocapture`.
+//! falls to 2.2 Ah at the first event.
+//!
+//! To print the table: `cargo test --workspace --test integration paper_scenario -- --nocapture`.
 
 use std::path::Path;
 
@@ -15,18 +16,18 @@ use packwatch::monitor::MonitorConfig;
 use packwatch::quantity::CellIndex;
 use packwatch::sim::{Scenario, Settings};
 
-/// Number of cycles in which the filter may still settle from its initial values.
+/// Number of initial cycles in which the filter may still settle.
 const SETTLING_CYCLES: usize = 1;
 /// Number of cycles until the sensor offset and the fade per cycle are known.
 const LEARNING_CYCLES: usize = 3;
-/// Largest |SOC error| of any sample. The paper's figures: 0.05, and 0.20 at the end of life.
+/// Largest allowed |SOC error| of any sample. The paper's figures show 0.05, and 0.20 at the end of life.
 const MAX_SOC_ERROR: f64 = 0.005;
-/// Largest relative |capacity error| at the end of a cycle. The current sensor's gain error alone causes half of it.
+/// Largest allowed relative |capacity error| at the end of a cycle. The current sensor's gain error alone causes half
+/// of it.
 const MAX_CAPACITY_ERROR: f64 = 0.01;
 /// Minimum fraction of cycles in which the true capacity lies within two stated standard deviations of the estimate.
 const MIN_COVERAGE: f64 = 0.90;
 
-/// Errors of one cycle.
 #[derive(Debug, Clone, Copy, Default)]
 struct Cycle {
     true_ah: f64,

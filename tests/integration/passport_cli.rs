@@ -1,11 +1,11 @@
-//! Runs `packwatch passport` as a user does. Checks the values against the store's own numbers, unknown values, and the
-//! formats of both standards.
+//! Runs `packwatch passport` as a user does. Checks the values against the numbers in the store, the handling of
+//! unknown values, and the formats of both standards.
 //!
-//! Two peers also check the formats. If one is missing, its test reports that it was skipped:
+//! Two peers also check the formats. If a peer is missing, its test reports that it was skipped:
 //!
-//! - IDTA's template through `aas-submodel-validate`: `PACKWATCH_PYTHON` names a Python that has it
-//! - the published JSON schemas: `PACKWATCH_SCHEMAS` also names a folder with `ProductConditionBattery-schema.json`
-//!   (1.0.1) and `BatteryPass-schema.json` (6.0.0)
+//! - IDTA's template, checked by `aas-submodel-validate`. `PACKWATCH_PYTHON` names a Python that has this package.
+//! - the published JSON schemas. `PACKWATCH_SCHEMAS` names a folder with `ProductConditionBattery-schema.json` (1.0.1)
+//!   and `BatteryPass-schema.json` (6.0.0).
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -14,7 +14,7 @@ use std::process::Output;
 use assert_cmd::Command;
 use serde_json::{Value, json};
 
-/// Strings of the simulated pack; each carries half of the pack current.
+/// Strings of the simulated pack. Each string carries half of the pack current.
 const STRINGS: f64 = 2.0;
 const RATED_AH: f64 = 2.0;
 
@@ -45,7 +45,7 @@ fn good(args: &[&str]) -> String {
     String::from_utf8(output.stdout).expect("text")
 }
 
-/// Standard error of a rejected command, which must not write anything.
+/// Standard error of a rejected command. The command must not write anything.
 fn refused(args: &[&str]) -> String {
     let output = packwatch(args);
     assert_eq!(output.status.code(), Some(1), "{args:?}: {}", String::from_utf8_lossy(&output.stdout));
@@ -61,13 +61,12 @@ fn shipped(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join(name)
 }
 
-/// The manufacturer's part for the measured cell.
+/// The document with the manufacturer's data for the measured cell.
 fn cell_part() -> Value {
     let text = fs::read_to_string(shipped("tests/integration/passport_cli/manufacturer.json")).expect("a file");
     serde_json::from_str(&text).expect("JSON")
 }
 
-/// The manufacturer's part for the simulated pack of two such cells.
 fn manufacturer() -> Value {
     let mut part = cell_part();
     part["performance"]["rated"]["capacity"]["value"] = json!(4.0);
@@ -79,7 +78,6 @@ fn close(a: f64, b: f64) -> bool {
     (a - b).abs() <= 1e-6 * b.abs().max(1.0)
 }
 
-/// A simulated life of a pack with one cell in series and two strings, with a store.
 struct Life(tempfile::TempDir);
 
 impl Life {
@@ -90,7 +88,6 @@ impl Life {
         life
     }
 
-    /// A folder with a configuration, to which `more` is appended.
     fn configured(more: &str) -> Self {
         let life = Self(tempfile::tempdir().expect("a folder"));
         let mut text = fs::read_to_string(shipped("config/measured.toml")).expect("a file");
@@ -124,14 +121,14 @@ impl Life {
         good(&[&args, more].concat());
     }
 
-    /// Appends two minutes at rest to a log, because the simulation ends under load.
+    /// Appends two minutes at rest to a log because the simulation ends under load.
     fn rest(&self, log: &str) {
         let mut text = fs::read_to_string(self.path(log)).expect("a log");
         let last = text.lines().last().expect("a line").to_owned();
         let (end_s, data) = (&last[1..last.find('.').expect("a stamp")], &last[last.find('#').expect("a frame") + 1..]);
         let end_s: u64 = end_s.parse().expect("a number");
-        // Bytes 0 to 2 contain the voltage in 10 uV, bytes 3 to 5 the current in 0.1 mA. At rest, the voltage is without
-        // the drop in 0.1 ohm.
+        // The voltage (bytes 0 to 2) is in 10 uV, the current (bytes 3 to 5) in 0.1 mA. At rest, the drop across 0.1
+        // ohm is missing.
         let number = |at: usize| {
             let byte = |k: usize| i32::from_str_radix(&data[2 * k..2 * k + 2], 16).expect("a byte");
             (byte(at + 2) << 24 | byte(at + 1) << 16 | byte(at) << 8) >> 8
@@ -151,7 +148,6 @@ impl Life {
         good(&[&["replay", "-c", &self.path("pack.toml"), "--state", &self.path("state")], &logs[..]].concat());
     }
 
-    /// Arguments for a passport from the store, for a battery recorded since new.
     fn of_store(&self) -> Vec<String> {
         let args = ["-c", &self.path("pack.toml"), "--state", &self.path("state"), "--throughput-before-ah", "0"];
         args.map(str::to_owned).to_vec()
@@ -203,7 +199,7 @@ fn passport_matches_store_and_is_reproducible() {
     for absent in ["EnergyThroughput", "StateOfCertifiedEnergy", "CurrentSelfDischargingRate"] {
         assert!(condition.get(absent).is_none(), "{absent}: {condition}");
     }
-    // The charges of this scenario end at 4.27 V, the cell model at 4.2 V.
+    // The charges of this scenario end at 4.27 V; the limit of the cell model is 4.2 V.
     let event = condition["NegativeEvents"][0]["NegativeEventValue"].as_str().unwrap();
     assert!(event.starts_with("overcharge: cell voltage above its limit: "), "{event}");
     let why = |name: &str| {
@@ -225,14 +221,14 @@ fn replay_passport_matches_store_plus_energy() {
     let mut whole = replayed("0");
     let energy = whole.as_object_mut().unwrap().remove("EnergyThroughput").expect("a replay has voltages");
     let energy_wh = 1e3 * energy["EnergyThroughputValue"].as_f64().unwrap();
-    // The last charge, of about 2.3 Ah, is incomplete: its energy has been counted, its charge has not.
+    // The last charge of about 2.3 Ah is incomplete. Its energy has been counted, but not its charge.
     let moved_ah = stored["CapacityThroughput"]["CapacityThroughputValue"].as_f64().unwrap();
     assert!((3.5 * moved_ah..4.3 * (moved_ah + 2.3)).contains(&energy_wh), "{energy_wh} Wh, {moved_ah} Ah");
     for group in stored.as_object().unwrap().keys() {
         let pairs = stored[group].as_object().into_iter().flatten();
         for (name, value) in pairs.filter(|(name, _)| *name != "LastUpdate") {
             let (one, other) = (value.as_f64().unwrap(), whole[group][name].as_f64().unwrap());
-            // The store keeps complete rows but rounds its last state.
+            // The store keeps rows exactly but rounds its last state.
             assert!((one - other).abs() <= 1e-3 * one.abs().max(1.0), "{group}.{name}: {one} and {other}");
         }
     }
@@ -271,7 +267,7 @@ fn soce_needs_certified_energy() {
     let condition = passport(&with(&args, &["--static", &accidents, "--certified-energy-kwh", "0.014"]));
     let energy_kwh = condition["RemainingEnergy"]["RemainingEnergyValue"].as_f64().unwrap();
     let soce = condition["StateOfCertifiedEnergy"]["StateOfCertifiedEnergyValue"].as_f64().unwrap();
-    // The energy of 3.8 Ah at about 3.6 V.
+    // Energy of 3.8 Ah at about 3.6 V.
     assert!((0.011..0.0150).contains(&energy_kwh), "{energy_kwh} kWh");
     assert!((soce - 100.0 * energy_kwh / 0.014).abs() < 0.01, "{soce} %");
     let path = life.write("manufacturer.json", &manufacturer());
@@ -325,7 +321,7 @@ fn static_template_is_accepted_once_filled_in() {
     let life = Life::new();
     let (log, config) = (life.path("life.log"), life.path("pack.toml"));
     let template = passport(&["--form", "battery-pass", "--static-template"]);
-    // It has a place for everything that the manufacturer states, and none for a measured value.
+    // The template must have a place for everything that the manufacturer states, but not for measured values.
     let mut filled = template.clone();
     fill_in(&mut filled, &manufacturer());
     assert!(template.pointer("/performance/dynamic/fullCycles").is_none(), "{template}");
@@ -345,7 +341,7 @@ fn with_file<'a>(args: &[&'a str], file: &'a str) -> Vec<&'a str> {
     args.iter().copied().chain([file]).collect()
 }
 
-/// Replaces the values of a template by those of `known`; every value must have its place.
+/// Replaces the values of a template by those of `known`. The template must contain every member of `known`.
 fn fill_in(template: &mut Value, known: &Value) {
     match (template, known) {
         (Value::Object(members), Value::Object(known)) => known.iter().for_each(|(name, value)| {
@@ -378,7 +374,6 @@ fn members(document: &Value, at: &str, found: &mut Vec<String>) {
     }
 }
 
-/// Removes a member. Returns its path as an error names it.
 fn removed(document: &mut Value, pointer: &str) -> String {
     let (parent, name) = pointer.rsplit_once('/').unwrap();
     document.pointer_mut(parent).unwrap().as_object_mut().unwrap().remove(name);
@@ -418,12 +413,11 @@ fn missing_static_members_are_named() {
     ];
     let mut pointers = Vec::new();
     members(&manufacturer(), "", &mut pointers);
-    // Skip the members of list items, mostly of documents, whose names begin with `c` or `header`.
+    // Skip the members of list items. Most belong to documents, whose names begin with `c` or `header`.
     let is_wanted = |pointer: &&String| !pointer.contains("/0/c") && !pointer.contains("/0/header");
     let mut document = manufacturer();
     let mut expected = Vec::new();
-    // Remove from the deepest level up, so that each member is missing alone. The module's tests remove members that
-    // contain others.
+    // Remove members from the deepest level up, so that each member is missing alone.
     for pointer in pointers.iter().rev().filter(is_wanted) {
         let is_leaf = manufacturer().pointer(pointer).is_some_and(|value| !value.is_object() && !value.is_array());
         let (_, name) = pointer.rsplit_once('/').unwrap();
@@ -505,7 +499,7 @@ fn new_pack_or_undated_record_gives_no_passport() {
 fn deleted_half_cycles_count_in_sums() {
     let life = Life::configured("\n[store]\nkeep_years = 0.1\n");
     life.simulate("old.log", "1700000000", &["--cycles", "2"]);
-    // Two months later the old half-cycles exceed their maximum age.
+    // Two months later, the old half-cycles exceed their maximum age.
     life.simulate("new.log", "1706000000", &["--cycles", "2"]);
     life.rest("old.log");
     life.replay(&["old.log", "new.log"]);
@@ -539,7 +533,6 @@ fn tampered_history_gives_no_passport() {
     );
 }
 
-/// Arguments for a passport from logs, for a battery recorded since new.
 fn of_logs(life: &Life, logs: &[&str]) -> Vec<String> {
     let mut args = vec!["-c".to_owned(), life.path("pack.toml")];
     args.extend(logs.iter().map(|log| life.path(log)));
@@ -595,7 +588,7 @@ fn sleep_between_trips_loses_no_charge() {
     life.rest("first.log");
     life.simulate("second.log", "1700040000", &["--cycles", "1"]);
     let text = fs::read_to_string(life.path("pack.toml")).expect("a file");
-    // With the shorter age, the buses count as asleep before the recorder does.
+    // With the shorter age, the buses already count as asleep while the recorder still counts them as awake.
     for age in ["max_age_s = 60.0", "max_age_s = 5.0"] {
         fs::write(life.path("pack.toml"), text.replace("max_age_s = 60.0", age)).expect("written");
         let args = of_logs(&life, &["first.log", "second.log"]);
@@ -650,7 +643,7 @@ fn value_from_unset_clock_is_undated() {
     assert!(moved.contains("a log begins before the end of the previous log"), "{moved}");
 }
 
-/// Output of a peer for a passport. Prints a note and returns `None` if the peer is missing.
+/// Output of a peer for a passport. If the peer is missing, prints a note and returns `None`.
 #[expect(clippy::print_stdout, reason = "a skipped test prints the reason")]
 fn peer(arguments: &[&str]) -> Option<String> {
     let Some(python) = std::env::var_os("PACKWATCH_PYTHON") else {
@@ -663,7 +656,6 @@ fn peer(arguments: &[&str]) -> Option<String> {
     Some(String::from_utf8(output.stdout).expect("text"))
 }
 
-/// Output of the published schema's check.
 #[expect(clippy::print_stdout, reason = "a skipped test prints the reason")]
 fn schema(name: &str, document: &str) -> Option<String> {
     let Some(folder) = std::env::var_os("PACKWATCH_SCHEMAS") else {
@@ -673,7 +665,6 @@ fn schema(name: &str, document: &str) -> Option<String> {
     peer(&["schema", &Path::new(&folder).join(name).display().to_string(), document])
 }
 
-/// Writes both passports of a record to files.
 fn both(life: &Life, args: &[&str], (part, certified_kwh): (&Value, &str)) -> (String, String) {
     let (condition, pass) = (life.path("condition.json"), life.path("battery_pass.json"));
     let (accidents, path) = (life.path("accidents.json"), life.write("manufacturer.json", part));
@@ -721,7 +712,7 @@ fn measured_life_gives_valid_passports() {
     let faults = [peer(&["submodel", &condition]), schema("ProductConditionBattery-schema.json", &condition)];
     assert!(faults.iter().flatten().all(String::is_empty), "{faults:?}");
     let of_replay: Value = serde_json::from_str(&fs::read_to_string(&condition).unwrap()).unwrap();
-    // 168 discharges with published capacities from 1.86 to 1.29 Ah, and as many charges.
+    // The record has 168 discharges with published capacities from 1.86 to 1.29 Ah, and as many charges.
     let moved_ah = of_replay["CapacityThroughput"]["CapacityThroughputValue"].as_f64().unwrap();
     assert!((480.0..560.0).contains(&moved_ah), "{moved_ah} Ah");
     assert_eq!(of_replay["NumberOfFullCycles"]["NumberOfFullCyclesValue"], json!((moved_ah / 4.0).floor() as u64));

@@ -1,5 +1,5 @@
-//! Tests bad frames of protected messages, and floods, as inputs of the core. Each bad frame is counted and reported.
-//! No bad frame changes an estimate, and other messages are still processed.
+//! Tests bad frames of protected messages, and floods. Each bad frame must be counted and reported, and must not change
+//! an estimate.
 
 use crate::support::config_texts;
 use packwatch::can::e2e::{Profile, Protection, Status};
@@ -14,8 +14,8 @@ const CURRENT: CanId = CanId::Standard(0x100);
 const CELL_1: CanId = CanId::Standard(0x110);
 const CELL_2: CanId = CanId::Standard(0x111);
 
-/// The current has a message with profile 1A. Each cell's voltage has its own message: the first with profile 5, the
-/// second unprotected.
+/// The current is in a message with profile 1A. Each cell's voltage has its own message. The first cell's message has
+/// profile 5, the second cell's is unprotected.
 const DBC: &str = r#"VERSION ""
 NS_ :
 BS_:
@@ -58,14 +58,12 @@ fn configuration() -> MonitorConfig {
     config_texts::load(PACK, DBC).monitor
 }
 
-/// A bus with three senders, connected to the core.
 struct Bench {
     monitor: Monitor,
     out: Outputs,
     events: Vec<Event>,
     estimates: Vec<Estimate>,
     now: Timestamp,
-    /// The counters of the two protected senders.
     counters: [u8; 2],
 }
 
@@ -85,7 +83,6 @@ impl Bench {
         }
     }
 
-    /// A bench that has already started to follow both senders.
     fn running() -> Self {
         let mut bench = Self::new();
         (0..20).for_each(|_| bench.cycle());
@@ -98,7 +95,7 @@ impl Bench {
         self.estimates.clear();
     }
 
-    /// Collects the outputs now, without waiting for the rest of a round of voltages.
+    /// Collects the outputs without waiting for the rest of a round of voltages.
     fn take(&mut self) {
         self.monitor.settle(&mut self.out);
         self.events.append(&mut self.out.events);
@@ -111,7 +108,7 @@ impl Bench {
         self.take();
     }
 
-    /// Advances by 100 ms, with the driver's ticks.
+    /// Advances by 100 ms, with ticks.
     fn wait(&mut self) {
         for _ in 0..10 {
             self.now = self.now.plus_nanos(10_000_000);
@@ -188,7 +185,6 @@ fn cell_2(voltage_v: f64) -> Frame {
     Frame::classic(CELL_2, &payload).unwrap()
 }
 
-/// The frame with one bit of its last byte flipped.
 fn damaged(frame: Frame) -> Frame {
     let mut payload = frame.data().to_vec();
     payload[7] ^= 1;
@@ -280,7 +276,7 @@ fn excessive_counter_skip_is_rejected() {
 fn replayed_frame_is_rejected_and_stream_continues() {
     let mut bench = Bench::running();
     bench.wait();
-    let old = current(bench.counters[0].wrapping_sub(4), -50.0); // sent and used earlier
+    let old = current(bench.counters[0].wrapping_sub(4), -50.0); // this frame was already sent and used
     bench.give(old);
     assert_eq!(bench.count(CURRENT, Status::WrongSequence), 1);
     let current_bad = EventKind::SignalBad { channel: Channel::Current, fault: Fault::EndToEnd };
@@ -324,7 +320,7 @@ fn flood_of_one_identifier_is_limited() {
     let mut bench = Bench::running();
     let mut sent = 0;
     for _ in 0..20 {
-        // Send 10,000 frames a second of an unprotected message: five times the limit.
+        // Send 10,000 frames a second of an unprotected message. This is five times the limit.
         for _ in 0..1000 {
             bench.now = bench.now.plus_nanos(100_000);
             bench.give(cell_2(3.9));

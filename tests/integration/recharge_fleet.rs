@@ -1,11 +1,11 @@
-//! Tests normalised recharge periods through the whole core: simulated cells -> sensors -> frames -> Monitor. The
-//! normalised period is the time that a charge over the SOC window would take at the reference current.
+//! Tests normalised recharge periods through the whole core. The normalised period is the time that a charge over the
+//! SOC window would take at the reference current.
 //!
-//! Simulates a fleet of cells of 1.4 to 2.6 Ah. Each cell has its own charger (0.3 to 1.2 C, constant current, then
-//! constant voltage), temperature (5 to 40 degrees C) and depth of discharge. Its current sensor has 20 mA noise, and
-//! 10 mA offset and 0.5 % gain of either sign; its voltage sensor has 5 mV noise. The normalised period must rank the
-//! cells by their true capacity, and its stated interval must contain the truth. One life has a charger that becomes
-//! weaker half-way. Also checks the alarm.
+//! The fleet has simulated cells of 1.4 to 2.6 Ah. Each cell has its own charger (0.3 to 1.2 C, constant current, then
+//! constant voltage), temperature (5 to 40 degrees C) and depth of discharge. Its current sensor has 20 mA noise, 10 mA
+//! offset and 0.5 % gain error. Its voltage sensor has 5 mV noise. The normalised period must rank the cells by their
+//! true capacity, and its interval must contain the truth. In one life the charger becomes weaker half-way.
+//!
 //! To print the tables: `cargo test --workspace --test integration recharge_fleet -- --nocapture`.
 
 use std::path::Path;
@@ -24,20 +24,19 @@ use rand_chacha::ChaCha8Rng;
 
 const RATED_AH: f64 = 2.6;
 const FLEET: usize = 40;
-/// SOC ranges of the charges. The window is 30 to 90 %. Three ranges extend beyond the window, one equals the window,
-/// and one covers only a part.
+/// SOC ranges of the charges. Three extend beyond the window (30 to 90 %), one equals it, and one covers only a part of
+/// it.
 const DEPTHS: [(f64, f64); 5] = [(0.20, 0.95), (0.25, 0.92), (0.10, 0.98), (0.30, 0.90), (0.40, 0.85)];
-/// Number of cycles before the fleet is judged.
+/// Number of cycles of each cell. The last cycle is evaluated.
 const CYCLES: u32 = 4;
 const REST_S: u32 = 600;
-/// Charging ends when the current at constant voltage has fallen to this (A): C/20.
+/// Charging ends when the current at constant voltage has fallen to this value (A): C/20.
 const TAPER_END_A: f64 = RATED_AH / 20.0;
 
 /// `PACKWATCH_Health` and its page with the recharge periods, as in `config/packwatch.dbc`.
 const HEALTH_ID: CanId = CanId::Standard(1713);
 const RECHARGE_PAGE: u8 = 1;
 
-/// Seeded uniform and normal numbers.
 struct Dice(ChaCha8Rng);
 
 impl Dice {
@@ -58,7 +57,6 @@ impl Dice {
     }
 }
 
-/// Usage of a cell.
 #[derive(Debug, Clone, Copy)]
 struct Usage {
     capacity_ah: f64,
@@ -76,12 +74,11 @@ struct ChargeReport {
     raw_s: Option<f64>,
     normalised_s: Option<f64>,
     std_s: Option<f64>,
-    /// For comparison: the period calculated from this charge alone (s). The charge per SOC, measured inside the
-    /// window, is multiplied by the window's width and divided by the reference current.
+    /// Period calculated from this charge alone, for comparison (s): charge per SOC inside the window, times the
+    /// window's width, divided by the reference current.
     own_charge_s: Option<f64>,
 }
 
-/// A simulated cell with its sensors and its Monitor.
 struct Rig {
     config: MonitorConfig,
     pack: Pack,
@@ -96,7 +93,7 @@ struct Rig {
     reported: ChargeReport,
     alarms: u32,
     health: Option<[u8; 8]>,
-    /// Counted charge (A s) and estimated SOC: first when the present charge entered the window, then now.
+    /// Counted charge (A s) and estimated SOC: when the present charge entered the window, and now.
     own: Option<[(f64, f64); 2]>,
     counted_as: f64,
 }
@@ -117,7 +114,7 @@ impl Rig {
             ..usual
         };
         let mut pack = Pack::new(config.model.clone(), settings, seed);
-        pack.complete_cycle(); // the resistance grows
+        pack.complete_cycle(); // creates the resistance growth
         let mut dice = Dice::new(seed);
         let (gain, offset_a) = (0.005 * dice.sign(), 0.010 * dice.sign());
         Self {
@@ -139,7 +136,7 @@ impl Rig {
         }
     }
 
-    /// Simulates one second at `current_a`: sends the sensors' frames, then advances the truth.
+    /// Simulates one second at `current_a`: sends the sensors' frames, then advances the cell.
     fn second(&mut self, current_a: f64) {
         let measured_a = current_a * (1.0 + self.gain) + self.offset_a + 0.020 * self.dice.normal();
         let voltage_v = self.pack.lowest_v(current_a) + 0.005 * self.dice.normal();
@@ -201,7 +198,6 @@ impl Rig {
         self.pack.cells()[0].soc
     }
 
-    /// Discharge, rest, charge, rest. Returns the report on the charge.
     fn cycle(&mut self, usage: &Usage) -> ChargeReport {
         self.reported = ChargeReport::default();
         let (low_v, high_v) = (self.config.model.voltage_min_v, self.config.model.voltage_max_v);
@@ -221,7 +217,6 @@ impl Rig {
     }
 }
 
-/// The paper's configuration, for cells whose rated capacity alone is known.
 fn configuration() -> MonitorConfig {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/paper.toml");
     let mut config = config::load(&path).unwrap_or_else(|faults| panic!("{}", faults.0.join("\n"))).monitor;
@@ -238,7 +233,7 @@ fn true_period_s(capacity_ah: f64) -> f64 {
     3600.0 * 0.6 * capacity_ah / (RATED_AH / 2.0)
 }
 
-/// Rank correlation, over the pairs whose second value is known.
+/// Rank correlation over the pairs whose second value is known.
 fn spearman(pairs: &[(f64, Option<f64>)]) -> f64 {
     let known: Vec<(f64, f64)> = pairs.iter().filter_map(|&(x, y)| Some((x, y?))).collect();
     let ranks = |values: Vec<f64>| -> Vec<f64> {
@@ -256,7 +251,7 @@ fn fleet() -> Vec<(Usage, ChargeReport)> {
         let worn = k as f64 / (FLEET - 1) as f64;
         Usage {
             capacity_ah: 2.6 - 1.2 * worn,
-            // The resistance of worn cells has grown, by different amounts.
+            // The resistance of worn cells has grown by different amounts.
             resistance_growth: 0.5 * worn + dice.uniform(0.0, 0.2),
             fade_ah: 0.0,
             temperature_c: dice.uniform(5.0, 40.0),
@@ -359,7 +354,8 @@ fn weaker_charger_changes_only_raw_period() {
     let mean = |from: usize, to: usize, value: fn(&(f64, f64, f64)) -> f64| {
         life[from..to].iter().map(value).sum::<f64>() / (to - from) as f64
     };
-    // Compare three charges before the change with three after it, corrected for the cell's own fade.
+    // Compare three charges before the change of the charger with three charges after it. Correct for the cell's own
+    // fade.
     let (before, after) = ((WEAKER_FROM - 3, WEAKER_FROM), (WEAKER_FROM, WEAKER_FROM + 3));
     let jump = |value: fn(&(f64, f64, f64)) -> f64| mean(after.0, after.1, value) / mean(before.0, before.1, value);
     let faded = jump(|l| l.2);
@@ -372,7 +368,7 @@ fn weaker_charger_changes_only_raw_period() {
     assert!(worst < 0.03, "worst error {worst}");
 }
 
-/// Number of alarms in a few charges with a threshold of 3000 s and the given `alarm_on`, and the last health frame.
+/// Number of alarms in a few charges with a threshold of 3000 s, and the last health frame.
 fn alarms(usage: &Usage, alarm_on: RechargeAlarm) -> (u32, Option<[u8; 8]>) {
     let output = config::load(&Path::new(env!("CARGO_MANIFEST_DIR")).join("config/paper.toml")).ok();
     let mut config = configuration();
@@ -406,8 +402,8 @@ fn normalised_period_alarm_ignores_charger() {
         charge_a: RATED_AH,
         discharge_a: 0.5 * RATED_AH,
     };
-    // Periods: a cell of 2.5 Ah takes 4154 s at C/2 and 2060 s with this charger. A cell of 1.7 Ah takes 2825 s at C/2
-    // and 4900 s with a weak charger.
+    // A cell of 2.5 Ah takes 4154 s at C/2 and 2060 s with this charger. A cell of 1.7 Ah takes 2825 s at C/2 and 4900
+    // s with a weak charger.
     let worn = Usage { capacity_ah: 1.7, charge_a: 0.3 * RATED_AH, ..usual };
     let partly = Usage { depth: DEPTHS[4], ..worn };
     let raised = |usage: &Usage, alarm_on| alarms(usage, alarm_on).0;

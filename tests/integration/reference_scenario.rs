@@ -1,12 +1,13 @@
-//! Runs the published 30 Ah example (scenario `reference`) through the whole core: ten cycles between 30 and 90 %
-//! SOC, with discharge by random pulses, charge at 15 A, and 1 Ah lost per cycle. The example claims a final SOC
+//! Runs the published 30 Ah example (scenario `reference`) through the whole core: ten cycles between 30 and 90 % SOC.
+//! Each cycle has a discharge by random pulses and a charge at 15 A, and loses 1 Ah. The example claims a final SOC
 //! error below 0.5 %.
 //!
-//! The example's tables are not published. This test uses the tables of `config/cells/example_nmc_2600.toml`, scaled to
-//! 30 Ah, as if eleven and a half such cells were connected in parallel: resistances are divided by 30 / 2.6,
-//! capacitances are multiplied by 30 / 2.6. Samples and sensors are as in the scenario `paper`: one sample per second;
+//! The example's tables are not published. This test scales `config/cells/example_nmc_2600.toml` to 30 Ah, as if 11.5
+//! such cells were connected in parallel. Samples and sensors are as in the scenario `paper`: one sample per second;
 //! voltage noise 5 mV; current noise 20 mA, offset 10 mA, gain error 0.5 %. The gain error limits the capacity accuracy
-//! of any estimator. To print the table: `cargo test --workspace --test integration reference_scenario -- --nocapture`.
+//! of any estimator.
+//!
+//! To print the table: `cargo test --workspace --test integration reference_scenario -- --nocapture`.
 
 use std::path::Path;
 
@@ -18,29 +19,23 @@ use packwatch::quantity::CellIndex;
 use packwatch::sim::{Scenario, Settings};
 
 const CAPACITY_AH: f64 = 30.0;
-/// Model error. The simulated cell matches the model, so only sensor noise and the kinks of the interpolated tables
-/// cause errors. The default of 0.15 is for measured cells. With it, the capacity would lag behind the loss of 1 Ah per
-/// cycle, by 2.2 % at the end.
+/// Model error. It is small because the simulated cell matches the model. With the default of 0.15, which is for
+/// measured cells, the capacity estimate would lag behind the loss of 1 Ah per cycle, by 2.2 % at the end.
 const MODEL_ERROR_V_SQRT_S: f64 = 0.03;
-/// Fade of the example's cell per full cycle: 1 Ah in a cycle of 60 %.
+/// Fade of the example's cell per full cycle: it loses 1 Ah in a cycle of 60 %.
 const NOISE_AH_PER_CYCLE: f64 = 1.7;
-/// Final SOC error that the example claims.
 const MAX_FINAL_SOC_ERROR: f64 = 0.005;
-/// Largest relative capacity error at the end.
 const MAX_CAPACITY_ERROR: f64 = 0.01;
 
-/// Errors of one cycle.
 #[derive(Debug, Clone, Copy, Default)]
 struct Cycle {
     true_ah: f64,
     estimated_ah: f64,
     std_ah: f64,
     max_soc_error: f64,
-    /// SOC error at the cycle's last sample.
     end_soc_error: f64,
 }
 
-/// The configuration `config/paper.toml`, with its cell scaled to 30 Ah.
 fn configuration() -> MonitorConfig {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/paper.toml");
     let mut config = config::load(&path).unwrap_or_else(|faults| panic!("{}", faults.0.join("\n"))).monitor;

@@ -17,7 +17,6 @@ fn replay(args: &[&str]) -> assert_cmd::assert::Assert {
     command.arg("replay").arg("-c").arg(config()).args(args).assert()
 }
 
-/// Half an hour of discharge pulses, one row per second.
 fn log(folder: &Path) -> String {
     let mut text = String::from("time_s,current_a,voltage_v,temperature_c\n");
     for second in 0..1800 {
@@ -120,7 +119,6 @@ fn snapshot_beyond_log_fails_without_file() {
     assert!(!Path::new(snapshot).exists());
 }
 
-/// CSV logs of a cell, one row per second, with the given durations.
 fn trips(folder: &Path, seconds: [u32; 3]) -> [String; 3] {
     [0, 1, 2].map(|n| {
         let path = folder.join(format!("trip{n}.csv"));
@@ -224,11 +222,11 @@ fn batched_replay_equals_record_by_record() {
     let folder = tempfile::tempdir().expect("a folder");
     let text = fs::read_to_string(log(folder.path())).expect("readable");
     let mut rows: Vec<String> = text.lines().map(str::to_owned).collect();
-    // A gap during which the recorder was asleep, a slightly older row, and a much older one.
+    // A gap while the recorder was asleep, then a slightly older row, then a much older row.
     rows.extend([4000, 4001, 3999, 4002, 4003, 900, 901, 902].map(|second| format!("{second},2.0,3.6,24.5")));
     let path = folder.path().join("holes.csv");
     fs::write(&path, rows.join("\n")).expect("written");
-    // With `--until` far beyond the log's end, replay reads record by record.
+    // If `--until` is far beyond the log's end, replay reads record by record.
     let results = [&[][..], &["--until", "+1000000"][..]].map(|one_by_one| {
         let paths = ["estimates", "events", "frames", "snapshot"].map(|kind| folder.path().join(kind));
         let [estimates, events, frames, snapshot] = paths.each_ref().map(|path| path.to_str().expect("UTF-8"));

@@ -29,7 +29,7 @@ fn config() -> String {
 struct Place(tempfile::TempDir);
 
 impl Place {
-    /// Writes a CSV of a cell that is discharged and charged a few times.
+    /// Writes a CSV log of a cell that is discharged and charged a few times.
     fn new() -> Self {
         let place = Self(tempfile::tempdir().expect("a folder"));
         let mut text = String::from("time_s,current_a,voltage_v,temperature_c\n");
@@ -55,7 +55,7 @@ impl Place {
     }
 }
 
-/// Whether the page's text contains "-0", "-0.0", "-0.00" and so on.
+/// Whether the page's text contains a negative zero ("-0", "-0.0", "-0.00" and so on).
 fn has_minus_zero(page: &str) -> bool {
     let texts = page.split('<').filter_map(|part| part.split_once('>')).map(|(_, text)| text.replace('\u{2212}', "-"));
     let mut words = texts.flat_map(|text| text.split([' ', ',', '(', ')']).map(str::to_owned).collect::<Vec<_>>());
@@ -157,7 +157,6 @@ fn life_report_shows_truth_and_forecast() {
     );
 }
 
-/// An installed browser.
 fn browser() -> Option<PathBuf> {
     let folders = std::env::var_os("PATH")?;
     let names = ["chromium", "chromium-browser", "google-chrome"];

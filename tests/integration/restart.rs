@@ -1,9 +1,8 @@
 //! Measures the cost of a restart: compares a run that is killed, or loses power, with an uninterrupted run.
 //!
-//! Input: days of the simulated electric car. After each drive the car rests with the bus awake, then the bus falls
-//! asleep. The state is stored every second, as the daemon does. At random times a second monitor starts from an older
-//! state, misses the frames of the downtime, and then receives the same frames as the first monitor. The test prints
-//! the results and checks their limits.
+//! The input is days of the simulated electric car. The state is stored every second, as the daemon does. At random
+//! times a second monitor starts from an older state and misses the frames of the downtime. Then it receives the same
+//! frames as the first monitor.
 
 use std::collections::VecDeque;
 use std::path::Path;
@@ -16,11 +15,11 @@ use packwatch::monitor::{Downtime, EventKind, Monitor, MonitorConfig, Outputs, R
 use packwatch::quantity::{BusIndex, CellIndex, Channel, Mode, SensorIndex, Timestamp};
 use packwatch::sim::{Pack, Scenario, Settings, Simulation, Wiring};
 
-/// Number of cells: enough for a spread, few enough for many cases.
+/// Eight cells show the differences between cells and leave time for many cases.
 const CELLS: u16 = 8;
 /// Rest with the bus awake after each drive (s).
 const REST_S: u32 = 900;
-/// Half-width of the 95 % interval of a normal distribution, in standard deviations.
+/// Half-width of the 95 % interval of a normal distribution.
 const SIGMAS: f64 = 1.96;
 
 fn configuration() -> MonitorConfig {
@@ -31,7 +30,6 @@ fn configuration() -> MonitorConfig {
     config
 }
 
-/// Pseudo-random numbers in 0 to 1.
 struct Draw(u64);
 
 impl Draw {
@@ -46,13 +44,12 @@ impl Draw {
         low + (high - low) * self.next()
     }
 
-    /// Approximately normal with unit deviation.
+    /// Approximately normal with unit standard deviation.
     fn noise(&mut self) -> f64 {
         (0..12).map(|_| self.next()).sum::<f64>() - 6.0
     }
 }
 
-/// A monitor and its outputs.
 struct Live {
     monitor: Monitor,
     out: Outputs,
@@ -83,17 +80,16 @@ impl Live {
         self.monitor.handle(&record, &mut self.out);
     }
 
-    /// Time, SOC and SOC deviation of a cell's last estimate.
+    /// Time, SOC and SOC standard deviation of a cell's last estimate.
     fn soc(&self, cell: usize) -> Option<(Timestamp, f64, f64)> {
         let latest = self.monitor.latest().nth(cell)??;
         Some((latest.time, latest.soc, latest.soc_std))
     }
 }
 
-/// One time step of a day: the readings.
 type Moment = (Timestamp, Vec<(Channel, Option<f64>)>);
 
-/// Readings of a day: ten currents and one round of cells per second.
+/// Readings of a day: ten currents and one round of cell voltages per second.
 fn day(config: &MonitorConfig, seed: u64) -> Vec<Moment> {
     let mut settings = Settings {
         seed,
@@ -124,7 +120,6 @@ fn day(config: &MonitorConfig, seed: u64) -> Vec<Moment> {
     moments
 }
 
-/// The parked car, with the bus still awake.
 fn rest(pack: &mut Pack, from: Timestamp, noise: &mut Draw, moments: &mut Vec<Moment>) {
     for second in 1..=REST_S {
         pack.step(0.0, 1.0);
@@ -141,38 +136,36 @@ fn rest(pack: &mut Pack, from: Timestamp, noise: &mut Draw, moments: &mut Vec<Mo
     }
 }
 
-/// A state as the daemon stores it, with the learned values.
+/// A state as the daemon stores it, and the learned capacities of the monitor.
 #[derive(Clone)]
 struct State {
     snapshot: Snapshot,
     learned: Vec<ScalarGaussian>,
 }
 
-/// Capacity of every cell.
 fn learned(monitor: &Monitor) -> Vec<ScalarGaussian> {
     (0..CELLS).map(|cell| monitor.capacity(CellIndex(cell))).collect()
 }
 
-/// A restarted monitor and its differences from the uninterrupted one.
 struct Case {
     live: Live,
     until: Timestamp,
     mode: Mode,
-    /// Per cell: difference and deviation at the first estimate, and the largest difference until the end.
+    /// Per cell: difference and stated standard deviation at the first estimate, and the largest difference until the
+    /// end.
     first: Vec<Option<(f64, f64)>>,
     largest: Vec<f64>,
-    /// Whether every capacity was bit-identical to the stored one.
+    /// Whether every restored capacity was bit-identical to the stored one.
     kept_learned: bool,
 }
 
-/// How the restart times are chosen.
+/// How the restart times are chosen: mean interval, age of the restored state, and downtime (s).
 struct Plan {
     every_s: f64,
     state_age_s: (f64, f64),
     away_s: (f64, f64),
 }
 
-/// Runs a day with restarts.
 fn run(config: &MonitorConfig, seed: u64, plan: &Plan) -> Vec<Case> {
     let encoder = InputEncoder::new(&config.input);
     let (mut whole, mut draw) = (Live::new(config), Draw(0x9E37_79B9 ^ seed));
@@ -219,15 +212,14 @@ fn start_waiting(
     let (up, still): (Vec<_>, Vec<_>) = waiting.drain(..).partition(|(up, ..)| time >= *up);
     *waiting = still;
     for (up, mode, state) in up {
-        // If no frame follows the restart within a second, the bus has fallen asleep. Skip this restart: another test
-        // covers the case.
+        // The bus has fallen asleep. Another test covers this case.
         if time.since(up) > 1.0 {
             continue;
         }
         let mut live = Live::restored(config, state.snapshot);
         live.give(Record::tick(time));
         active.push(Case {
-            // The downtime may complete a half-cycle, and the monitor then learns from it immediately.
+            // The downtime may complete a half-cycle. Then the monitor learns from it immediately.
             kept_learned: learned(&live.monitor) == state.learned
                 || live.out.events.iter().any(|event| matches!(event.kind, EventKind::Capacity { .. })),
             live,
@@ -254,7 +246,6 @@ impl Case {
     }
 }
 
-/// Statistics of many cases.
 struct Figures {
     restarts: usize,
     compared: usize,
@@ -320,8 +311,8 @@ fn interval_after_power_cut_covers_loss() {
     assert!(cases.iter().all(|case| case.kept_learned));
 }
 
-/// A drive, then `hours` of downtime in which the fraction `used` of the capacity is discharged, then a rest. Returns
-/// error and deviation of each cell after each reading.
+/// Simulates a drive, a downtime of `hours` that uses the fraction `used` of the capacity, and a rest. Returns SOC
+/// error and stated standard deviation of each cell after each reading.
 fn drive_after_downtime(config: &MonitorConfig, hours: f64, used: f64, seed: u64) -> Vec<(f64, f64)> {
     let encoder = InputEncoder::new(&config.input);
     let (mut live, mut noise, mut frames) = (Live::new(config), Draw(seed), Vec::new());

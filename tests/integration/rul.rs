@@ -1,6 +1,7 @@
-//! Checks forecasts of the remaining useful life: on measured lives, on simulated fades of many shapes (no parameter
-//! was tuned to these shapes), and by the Monitor on a simulated life. `tests/rul.md` has the results; `cargo test
-//! --test integration rul -- --nocapture` prints them.
+//! Checks forecasts of the remaining useful life on measured lives, on simulated fades of many shapes, and by the
+//! Monitor on a simulated life. No parameter was tuned to the simulated fades.
+//!
+//! `cargo test --test integration rul -- --nocapture` prints the results of `tests/rul.md`.
 
 use std::path::{Path, PathBuf};
 
@@ -70,7 +71,7 @@ impl Dice {
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Shape {
     Power(f64),
-    /// The rate changes by the given factor at the given fraction of the life.
+    /// The fade rate changes by the given factor at the given fraction of the life.
     Kink(f64, f64),
 }
 
@@ -87,7 +88,7 @@ impl Shape {
 }
 
 /// A life of random length and depth, with noise, correlated variation, and capacity that recovers after long rests. On
-/// the axis of days, the cell also ages during these rests.
+/// the axis of days, the cell also ages during the rests.
 fn life(shape: Shape, axis: Axis, dice: &mut Dice) -> (History, f64) {
     let (readings, depth) = (dice.between(40.0, 300.0).floor(), dice.between(0.2, 0.4));
     let days_each = if axis == Axis::Cycles { dice.between(0.15, 0.25) } else { dice.between(2.0, 5.0) };
@@ -156,7 +157,8 @@ fn forecast_interval_covers_many_fade_shapes() {
 
 #[test]
 fn on_board_life_is_forecast_from_half_cycles() {
-    // The paper's life: 2.6 Ah, fading by 0.05 Ah per cycle of 60 %. Here the life ends at 1.3 Ah, after 26 cycles.
+    // The life of `config/paper.toml`, which fades by 0.05 Ah per cycle of 60 %. Here it ends at 1.3 Ah, after 26
+    // cycles.
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/paper.toml");
     let mut config = config::load(&path).unwrap_or_else(|faults| panic!("{}", faults.0.join("\n"))).monitor;
     config.health.end_of_life_ah = 1.3;
@@ -206,7 +208,7 @@ fn print(scored: &[HistoryScore]) {
     }
 }
 
-/// A file with linear fade, 0.01 Ah per reading, five days between readings.
+/// Writes a file with a linear fade: 0.01 Ah per reading, five days between readings.
 fn straight_file(folder: &Path) -> PathBuf {
     let rows = (0..40).map(|n| format!("{},{:.3}\n", 432_000 * n, 2.0 - 0.01 * f64::from(n)));
     let path = folder.join("cell.csv");
@@ -228,7 +230,7 @@ fn command_forecasts_and_reports_unjudged() {
     let file = straight_file(folder.path());
     let file = file.to_str().unwrap();
     let now = json(&[file, "--end-of-life", "1.5,80 %", "--json"]);
-    // 1.61 Ah at the end, fading by 0.002 Ah a day: 55 days to 1.5 Ah.
+    // The capacity is 1.61 Ah and falls by 0.002 Ah per day, so 55 days remain until 1.5 Ah.
     let median = now["forecasts"][0]["remaining"]["days"]["median"].as_f64().unwrap();
     assert!((median - 55.0).abs() < 10.0, "{now}");
     assert_eq!(now["forecasts"][0]["remaining"]["cycles"], serde_json::Value::Null);

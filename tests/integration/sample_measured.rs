@@ -1,5 +1,5 @@
-//! Tests the sample stage on a measured life (NASA B0005, uneven time steps, real glitches). The stage must reject
-//! exactly the glitches, and each cycle's charge must match the table of the data set.
+//! Tests the sample stage on a measured life (NASA B0005) with uneven time steps and glitches. It must reject exactly
+//! the glitches, and each cycle's charge must match the data set's table.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -62,7 +62,6 @@ fn measured_life_loses_only_glitches() {
     assert!(compared > 300, "compared only {compared} cycles");
 }
 
-/// Compares each cycle's charge with the charge in the table. Returns the number of compared cycles.
 fn compare(folder: &Path, charges_ah: &BTreeMap<u32, (f64, f64)>) -> usize {
     let mut compared = 0;
     let mut table = csv::Reader::from_path(folder.join("B0005_cycles.csv")).expect("the table exists");

@@ -1,4 +1,4 @@
-//! Runs `packwatch score` as a user does, on files with an analytically known truth.
+//! Runs `packwatch score` as a user does, on files whose true values are known analytically.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -7,8 +7,8 @@ use assert_cmd::Command;
 use assert_cmd::assert::Assert;
 use serde_json::Value;
 
-/// A cell of 2 Ah with a linear open-circuit voltage, 3 V + 1.2 V x SOC, and a very small resistance, so that every
-/// estimate can be calculated by hand.
+/// A cell of 2 Ah. Its open-circuit voltage is linear (3 V + 1.2 V x SOC), and its resistance is very small, so that
+/// every estimate can be calculated by hand.
 const MODEL: &str = "format = 1
 name = \"straight\"
 rated_capacity_ah = 2.0
@@ -44,8 +44,7 @@ impl Bench {
         fs::write(self.path(name), text).unwrap();
     }
 
-    /// A discharge of `hours` at 1 A from full, one row per second. The voltages belong to a cell whose SOC is higher
-    /// by `offset`.
+    /// Writes a discharge of `hours` at 1 A from full. The voltages belong to a cell whose SOC is higher by `offset`.
     fn write_discharge(&self, name: &str, hours: f64, offset: f64) {
         let mut text = String::from("time_s,current_a,voltage_v,temperature_c,discharged_ah\n");
         for second in 0..=(hours * 3600.0) as u32 {
@@ -67,7 +66,6 @@ impl Bench {
     }
 }
 
-/// Standard error of a run that ended with `code`.
 fn fault(run: Assert, code: i32) -> String {
     String::from_utf8(run.code(code).get_output().stderr.clone()).unwrap()
 }
@@ -91,8 +89,7 @@ fn perfect_cell_converges_from_20_points() {
 
 #[test]
 fn cell_error_appears_in_score() {
-    // The voltages indicate a SOC 8 points above the counted charge. An estimator that trusts the voltages is therefore
-    // 8 points off, and the truth is outside its interval.
+    // The voltages indicate an SOC 8 points above the counted charge, and the estimator trusts them.
     let bench = Bench::new();
     bench.write_discharge("drive.csv", 1.5, 0.08);
     let score = &bench.json(&["drive.csv", "--start", "middle", "--told", "0", "--soc-std", "30"])["scores"][0];
@@ -103,8 +100,7 @@ fn cell_error_appears_in_score() {
 
 #[test]
 fn truth_uses_given_capacity() {
-    // After a discharge of 1.5 Ah, a cell of 2 Ah has 25 % left and a cell of 3 Ah has 50 % left. With a true capacity
-    // of 3 Ah, the estimate therefore ends 25 points below the truth.
+    // After 1.5 Ah, a cell of 2 Ah has 25 % left and a cell of 3 Ah has 50 % left.
     let bench = Bench::new();
     bench.write_discharge("drive.csv", 1.5, 0.0);
     let score = &bench.json(&["drive.csv", "--told", "0", "--truth-capacity", "3", "--settle", "0"])["scores"][0];
@@ -118,9 +114,9 @@ fn start_in_middle_drops_earlier_rows() {
     bench.write_discharge("drive.csv", 1.5, 0.0);
     let document = bench.json(&["drive.csv", "--start", "full,middle", "--told=-10", "--remove", "0.25"]);
     let rows: Vec<u64> = document["scores"].as_array().unwrap().iter().map(|s| s["rows"].as_u64().unwrap()).collect();
-    // The SOC reaches 0.75 when 0.25 of 2 Ah has been removed: after 1800 s at 1 A.
+    // At 1 A, the SOC falls to 0.75 (0.5 of 2 Ah removed) after 1800 s.
     assert_eq!(rows, [5401, 5401 - 1800]);
-    // The initial SOC is 10 points below the true 75 %. The first voltage already corrects a part of this error.
+    // The initial SOC is 10 points too low. The first voltage reading already corrects a part of this error.
     assert!((-10.1..-0.1).contains(&number(&document["scores"][1], "first_error_points")), "{document}");
 }
 
@@ -135,8 +131,8 @@ fn current_offset_is_added_before_core() {
         document["scores"].as_array().unwrap().iter().map(|s| s["current_offset_a"].as_f64().unwrap()).collect();
     assert_eq!(offsets, [-0.1, 0.0, 0.1]);
     let errors: Vec<_> = (0..3).map(|i| number(&document["scores"][i], "mean_error_points")).collect();
-    // With an offset of +0.1 A, more charge seems to leave than really does, so the estimate falls below the truth. The
-    // voltage keeps the error far below 7.5 points.
+    // With +0.1 A, more charge is counted than flows, so the estimate is too low. The voltage keeps the error far below
+    // 7.5 points.
     assert!(errors[0] > errors[1] + 0.02 && errors[2] < errors[1] - 0.02, "{errors:?}");
     assert!(errors.iter().all(|error| error.abs() < 1.5), "{errors:?}");
     let table = String::from_utf8(bench.score(&args).success().get_output().stdout.clone()).unwrap();
@@ -181,7 +177,7 @@ fn table_has_line_per_case_and_omissions() {
 
 #[test]
 fn life_is_scored_against_its_table() {
-    // Four discharges from 4.2 V to 3 V of a 2 Ah cell, with charges between them; the load's cut-off is 3 V.
+    // Four discharges of a 2 Ah cell from 4.2 V to the cut-off at 3 V, with charges between them.
     let bench = Bench::new();
     let mut text = String::from("cycle,type,time_s,current_a,voltage_v,temperature_c\n");
     let mut table = String::from("cycle,type,start,capacity_ah_source\n");

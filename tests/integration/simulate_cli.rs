@@ -15,7 +15,7 @@ fn packwatch(args: &[&str]) -> Output {
     command.args(args).output().expect("the binary starts")
 }
 
-/// Simulates half a minute of the 96-cell day into `folder`. Returns log and truth.
+/// Simulates half a minute of the scenario with 96 cells. Returns the paths of log and truth.
 fn simulate_day(folder: &Path, name: &str, seed: &str) -> (PathBuf, PathBuf) {
     let (log, truth) = (folder.join(format!("{name}.log")), folder.join(format!("{name}.csv")));
     let (log_text, truth_text) = (log.display().to_string(), truth.display().to_string());

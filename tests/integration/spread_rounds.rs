@@ -1,5 +1,5 @@
-//! The voltages of a large pack arrive in many frames, with ticks between them. The check of the current must still see
-//! whole rounds, also if the first cells belong to a module of another kind.
+//! Tests the check of the current if a pack's voltages arrive in many frames. It must use complete rounds of voltages,
+//! even if the first cells belong to a module of another kind.
 
 use std::fmt::Write as _;
 
@@ -14,7 +14,7 @@ use crate::support::rig::{DBC, PACK};
 const CELLS: u16 = 40;
 const MODULE: &str = "[[pack.module]]\ncells = \"1-20\"\nchemistry = \"nmc-graphite\"\nrated_capacity_ah = 2.6\n";
 
-/// The pack of the rig with [`CELLS`] cells: ten messages with four voltages each.
+/// The rig's pack with [`CELLS`] cells: ten messages with four voltages each.
 fn config(modules: &str) -> MonitorConfig {
     let pack = PACK
         .replace("cells = 2\n", "cells = 40\n")
@@ -30,12 +30,12 @@ fn config(modules: &str) -> MonitorConfig {
     config_texts::load(&format!("{pack}{modules}"), &dbc).monitor
 }
 
-/// Current (A): a new level every 10 s.
+/// Current (A). It changes every 10 s.
 fn load_a(second: u32) -> f64 {
     f64::from((second / 10).wrapping_mul(2_654_435_761) >> 24) / 64.0 - 2.0
 }
 
-/// Drives for 10 minutes and returns in how many seconds the cells were untrusted. The sensor has `sign`.
+/// Drives for 10 minutes. Returns in how many seconds a cell was untrusted.
 fn untrusted_seconds(modules: &str, sign: f64) -> u32 {
     let config = config(modules);
     let ohm = config.model.r0_ohm(&config.model.grid_position(0.5, 25.0));
@@ -51,7 +51,6 @@ fn untrusted_seconds(modules: &str, sign: f64) -> u32 {
         assert_eq!(frames.len(), 11);
         for centi in 0..100_u32 {
             let time = Timestamp::from_secs(f64::from(100 * second + centi) / 100.0);
-            // A message every 40 ms, with ticks in between.
             if let Some((bus, frame)) = frames.get(centi as usize / 4).filter(|_| centi % 4 == 0) {
                 monitor.handle(&Record { time, kind: RecordKind::Frame { bus: *bus, frame: *frame } }, &mut out);
             }
@@ -72,7 +71,6 @@ fn inverted_current_is_found_in_spread_rounds() {
     }
 }
 
-/// Gives the frames of a second and a tick.
 fn give(monitor: &mut Monitor, encoder: &InputEncoder, second: u32, current_a: f64, voltage_v: f64) {
     let mut values = vec![(Channel::Current, Some(current_a))];
     values.extend([0, 1].map(|sensor| (Channel::Temperature(SensorIndex(sensor)), Some(25.0))));

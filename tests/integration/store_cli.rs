@@ -1,4 +1,4 @@
-//! Tests state and history from a user's view: `replay --state`, `history`, `reset`.
+//! Tests state and history with `replay --state`, `history` and `reset`.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -25,7 +25,6 @@ fn bad(args: &[&str]) -> String {
     String::from_utf8(output.stderr).expect("text")
 }
 
-/// Writes a CSV of a cell that is discharged and charged a few times.
 fn log(folder: &Path) -> String {
     let mut text = String::from("time_s,current_a,voltage_v,temperature_c\n");
     let mut soc: f64 = 0.9;
@@ -45,7 +44,6 @@ struct Place {
 }
 
 impl Place {
-    /// Creates a state folder filled by a replay.
     fn filled() -> Self {
         let place = Self { folder: tempfile::tempdir().expect("a folder") };
         let log = log(place.folder.path());
@@ -141,7 +139,6 @@ fn in_report_and_export(_: &Place, _: &str, _: &str) {}
 fn verify_names_first_changed_rows() {
     let place = Place::filled();
     let before = fs::read(place.database()).expect("read");
-    // Find a capacity's bytes in the file and flip a bit.
     let rows = place.rows(&["--kind", "capacity"]);
     let wanted = rows[2]["capacity_ah"].as_f64().expect("a number").to_be_bytes();
     let at = before.windows(8).position(|window| window == wanted).expect("the capacity is in the file");

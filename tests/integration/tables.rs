@@ -1,5 +1,5 @@
-//! Tests that tables of cyclers and applications give the same estimates as packwatch's own table of the same data, and
-//! that tables in a wrong unit are refused.
+//! Tests tables of cyclers and applications. They must give the same estimates as packwatch's own table, or be rejected
+//! if a unit is wrong.
 
 mod exports;
 
@@ -13,7 +13,6 @@ use packwatch::io::log::{LogCounts, LogSource};
 use packwatch::monitor::{Estimate, Monitor};
 use packwatch::replay::{self, LogReading, ReplaySettings, Sinks};
 
-/// A configuration of equal cells of 2.6 Ah in series.
 fn configuration(folder: &Path, cells: usize) -> Config {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
     let signals: String =
@@ -36,7 +35,6 @@ fn configuration(folder: &Path, cells: usize) -> Config {
     config::load(&path).unwrap_or_else(|error| panic!("{error}"))
 }
 
-/// A test's folder and configuration.
 struct Bench {
     folder: tempfile::TempDir,
     config: Config,
@@ -55,7 +53,6 @@ impl Bench {
         path
     }
 
-    /// Replays a table. Returns the estimates and what was read.
     fn replay(&self, path: &Path, columns: &[(&str, &str)]) -> Result<(Vec<Estimate>, LogCounts), String> {
         let columns = columns.iter().map(|(role, name)| ((*role).to_owned(), (*name).to_owned())).collect();
         let reading = LogReading { columns, ..LogReading::default() };
@@ -74,7 +71,7 @@ impl Bench {
     }
 }
 
-/// Compares estimates whose clocks may have different origins.
+/// Compares estimates. The origins of their clocks may differ.
 fn compare(name: &str, found: &[Estimate], expected: &[Estimate]) {
     assert_eq!(found.len(), expected.len(), "{name}: number of estimates");
     let (begin, origin) = (found[0].time, expected[0].time);
@@ -171,11 +168,11 @@ fn values_in_wrong_unit_are_refused_by_name() {
         eprintln!("{name}: {error}");
         assert!(error.contains(expected) && error.contains("x.csv:1: "), "{name}: {error}");
     }
-    // Minutes are possible seconds, so they are read with a remark.
+    // Times in minutes could also be seconds, so the table is read and a remark is printed.
     let path = bench.file("x.csv", &scaled(&rows, own, [1.0 / 60.0, 1.0, 1.0]));
     let (_, counts) = bench.replay(&path, &[]).expect("reads");
     assert!(counts.tables[0].to_string().contains("advances like min"), "{}", counts.tables[0]);
-    // An impossible temperature costs its column only.
+    // If the temperatures are impossible, only their column is left out.
     let text = String::from_utf8(plain(&rows, true)).unwrap().replace(",25\n", ",850\n");
     let (_, counts) = bench.replay(&bench.file("x.csv", text.as_bytes()), &[]).expect("reads");
     assert!(counts.tables[0].to_string().contains("temperature_c is left out: 850"), "{}", counts.tables[0]);
@@ -223,7 +220,6 @@ fn user_names_unit_of_column() {
     assert!(wrong.is_err_and(|error| error.contains("b is in mV, so it cannot be the current")));
 }
 
-/// Writes a sample as a row of a table.
 type Row<'a> = &'a dyn Fn(&Sample) -> String;
 
 #[test]
@@ -281,7 +277,6 @@ fn single_impossible_current_is_refused_alone() {
     assert!(said.contains("99.8 % of 902 rows accepted, 1 currents refused (beyond 260 A"), "{said}");
 }
 
-/// Writes a Parquet file with columns of doubles.
 #[cfg(feature = "lab")]
 fn parquet(path: &Path, names: [&str; 3], rows: &[[f64; 3]]) {
     use parquet::data_type::DoubleType;
@@ -314,7 +309,7 @@ fn parquet_gives_estimates_of_plain_table() {
     parquet(&path, ["test_time_second", "current_milliampere", "voltage_volt"], &values);
     let (found, _) = bench.replay(&path, &[]).expect("reads");
     compare("Parquet", &found, &expected);
-    // A cut file is an error, not a panic.
+    // A truncated file must give an error, not a panic.
     let whole = std::fs::read(&path).unwrap();
     for length in [4, 100, whole.len() - 1] {
         std::fs::write(&path, &whole[..length]).unwrap();

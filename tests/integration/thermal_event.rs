@@ -1,5 +1,4 @@
-//! Short circuits inside a cell, from the readings on the bus to the alarm frame. The test prints the table of the page
-//! "Thermal event" in the manual.
+//! Tests internal short circuits of a cell. Prints the table for the manual's page "Thermal event".
 
 use std::fmt::Write as _;
 
@@ -64,12 +63,11 @@ fn config() -> MonitorConfig {
     config_texts::load(&pack, &dbc).monitor
 }
 
-/// A pack at rest whose cell 5 has an internal short circuit of `ohm` from [`SHORT_S`] on.
+/// A pack at rest. From [`SHORT_S`] on, one cell has an internal short circuit of `ohm`.
 struct Pack {
     ohm: f64,
     cell_c: f64,
     sensor_c: f64,
-    /// Charge that the cell has lost (Ah).
     lost_ah: f64,
 }
 
@@ -81,7 +79,7 @@ const OCV_V: f64 = 3.7;
 const SENSOR_DELAY_S: f64 = 20.0;
 
 impl Pack {
-    /// Voltage of the shorted cell (V) after another second.
+    /// Advances by one second. Returns the voltage of the shorted cell (V).
     fn step(&mut self) -> f64 {
         let short_a = OCV_V / (self.ohm + CELL_OHM);
         self.cell_c += OCV_V * short_a / CELL_J_PER_K;
@@ -94,7 +92,7 @@ impl Pack {
 /// The first alarm: time after the short circuit (s), cell, value, and temperature of the cell (degrees C).
 type Alarm = (f64, CellIndex, f64, f64);
 
-/// Runs from `begin_s` on until a new alarm, at most for ten minutes of short circuit.
+/// Runs from `begin_s` until a new alarm, for at most ten minutes after the short circuit.
 fn first_alarm(ohm: f64, begin_s: f64, monitor: &mut Monitor) -> Option<Alarm> {
     let encoder = InputEncoder::new(&config().input);
     let mut pack = Pack { ohm, cell_c: 25.0, sensor_c: 25.0, lost_ah: 0.0 };
@@ -137,7 +135,8 @@ fn first_alarm(ohm: f64, begin_s: f64, monitor: &mut Monitor) -> Option<Alarm> {
 #[test]
 fn short_circuit_raises_alarm_of_its_cell() {
     println!("| short circuit (mohm) | alarm after (s) | evidence | temperature of the cell (degrees C) |");
-    // Latest alarm (s) and evidence. A short circuit of 0.5 ohm takes 15 % of the charge in an hour: `cell_leak` finds it.
+    // Short circuit (ohm), latest alarm (s) and evidence. A short circuit of 0.5 ohm discharges 15 % in an hour;
+    // `cell_leak` detects it.
     let wanted = [(0.001, 4.0, 1.0), (0.003, 10.0, 1.0), (0.005, 25.0, 2.0), (0.02, 60.0, 2.0), (0.05, 120.0, 2.0)];
     for (ohm, latest_s, evidence) in wanted {
         let (after_s, cell, value, cell_c) = first_alarm(ohm, 0.0, &mut Monitor::new(config())).expect("an alarm");
@@ -154,7 +153,6 @@ fn alarm_stays_until_person_clears_it() {
     let (after_s, cell, ..) = first_alarm(0.001, 0.0, &mut monitor).unwrap();
     let state = |monitor: &Monitor| monitor.alarms().raised().next().map(|alarm| alarm.state);
     assert_eq!(state(&monitor), Some(AlarmState::Active));
-    // All readings end.
     let mut out = Outputs::default();
     let mut time = Timestamp::from_secs(f64::from(SHORT_S) + after_s);
     for _ in 0..3600 {
@@ -162,13 +160,12 @@ fn alarm_stays_until_person_clears_it() {
         monitor.handle(&Record { time, kind: RecordKind::Tick }, &mut out);
         assert!(state(&monitor).is_some());
     }
-    // A restart keeps the alarm.
     let snapshot = monitor.snapshot().for_restart();
     let mut restarted = Monitor::new(config());
     restarted.restore(snapshot, packwatch::monitor::Downtime::Seconds(5.0)).unwrap();
     restarted.handle(&Record { time, kind: RecordKind::Tick }, &mut out);
     assert!(state(&restarted).is_some());
-    // Good readings end the evidence, not the alarm.
+    // Good readings end the evidence, but the alarm stays latched.
     assert_eq!(first_alarm(f64::INFINITY, f64::from(SHORT_S) + 400.0, &mut restarted), None);
     assert_eq!(state(&restarted), Some(AlarmState::Latched), "{cell:?}");
     let clear = Command::Clear(packwatch::alarm::Selector::default());

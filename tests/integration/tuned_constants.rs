@@ -1,5 +1,5 @@
-//! Compares `docs/src/reference/tuned-constants.md` with the source. Every row must have the value of its constant and
-//! name a test that exists. Every floating-point constant of the algorithms must be a row or listed as not tuned.
+//! Compares `docs/src/reference/tuned-constants.md` with the source. Every row must have the constant's value and name
+//! a test. Every floating-point constant of the algorithms must be a row or listed as not tuned.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -24,7 +24,7 @@ const ALGORITHMS: [&str; 13] = [
     "lab/discover",
 ];
 
-/// A constant of a source file, with the text of its type and of its value.
+/// A constant of a source file, with the source text of its type and its value.
 struct Constant {
     name: String,
     type_text: String,
@@ -40,7 +40,6 @@ fn read(path: impl AsRef<Path>) -> String {
     fs::read_to_string(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
 }
 
-/// The Rust files of a folder, sorted, relative to `base`.
 fn rust_files(base: &Path, folder: &Path, found: &mut Vec<PathBuf>) {
     let mut paths: Vec<PathBuf> = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect();
     paths.sort();
@@ -53,13 +52,13 @@ fn rust_files(base: &Path, folder: &Path, found: &mut Vec<PathBuf>) {
     }
 }
 
-/// Source text without blanks and without the trailing commas of wrapped lines.
+/// Source text without white space and without the trailing commas of wrapped lines.
 fn compact(text: &str) -> String {
     let text: String = text.split_whitespace().collect();
     text.replace(",]", "]").replace(",)", ")").replace(",}", "}")
 }
 
-/// The constants of a source text, without the test module's constants.
+/// The constants of a source text, except those of the test module.
 fn constants(source: &str) -> Vec<Constant> {
     let code: Vec<&str> = source.lines().map(|line| line.split("//").next().unwrap_or_default()).collect();
     let code = code.join("\n");
@@ -76,7 +75,7 @@ fn constants(source: &str) -> Vec<Constant> {
             depth += i32::from("([{".contains(c)) - i32::from(")]}".contains(c));
             c == ';' && depth == 0
         });
-        // A parameter `const N: usize,` on a separate line has no value on that line.
+        // A generic parameter (`const N: usize,`) on its own line has no value.
         let item = end.and_then(|end| rest[..end].split_once(" =")).filter(|(type_text, _)| !type_text.contains('\n'));
         if let Some((type_text, value)) = item {
             found.push(Constant { name: name.into(), type_text: type_text.into(), value: compact(value) });
@@ -85,7 +84,6 @@ fn constants(source: &str) -> Vec<Constant> {
     found
 }
 
-/// The texts in backticks of a line.
 fn quoted(line: &str) -> Vec<&str> {
     line.split('`').skip(1).step_by(2).collect()
 }
@@ -118,7 +116,7 @@ fn not_tuned(page: &str) -> BTreeSet<(&str, &str)> {
     found
 }
 
-/// Whether a table of keys states this default, without its backticks. `key`: `table.key`.
+/// Whether the table of keys states this default. `key` has the form `table.key`; `default` has no backticks.
 fn has_default(source: &str, key: &str, default: &str) -> bool {
     let (table, key) = key.split_once('.').expect("table.key");
     let (_, section) = source.split_once(&format!("at \"{table}\"")).expect("the table");

@@ -1,11 +1,11 @@
-//! `packwatch mqtt`, `kuksa` and `vss` run the program `packwatch-uplink` if it is installed.
+//! Tests that `packwatch mqtt`, `kuksa` and `vss` run the program `packwatch-uplink` if it is installed.
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-/// A copy of the program in an otherwise empty folder.
+/// Creates a copy of the program in an otherwise empty folder.
 fn alone(folder: &Path) -> PathBuf {
     let (built, own) = (Path::new(env!("CARGO_BIN_EXE_packwatch")), folder.join("packwatch"));
     if fs::hard_link(built, &own).is_err() {
@@ -18,7 +18,6 @@ fn run(program: &Path, arguments: &[&str], path: &Path) -> Output {
     Command::new(program).args(arguments).env("PATH", path).output().unwrap()
 }
 
-/// Writes a program that prints its arguments, one per line.
 fn put_uplink(folder: &Path, word: &str) {
     let uplink = folder.join("packwatch-uplink");
     fs::write(&uplink, format!("#!/bin/sh\necho {word}\nprintf '%s\\n' \"$@\"\nexit 7\n")).unwrap();
@@ -46,8 +45,7 @@ fn uplink_gets_arguments_and_returns_exit_code() {
     let output = run(&program, &arguments, elsewhere.path());
     assert_eq!(String::from_utf8(output.stdout).unwrap(), "of-path\nmqtt\n-c\na b.toml\n--help\n--log=debug\n");
     assert_eq!(output.status.code(), Some(7));
-    // The uplink next to packwatch takes precedence over the uplink in PATH, because it has the same version as this
-    // packwatch.
+    // The uplink in packwatch's own folder takes precedence over the uplink in PATH because it has the same version.
     put_uplink(folder.path(), "beside");
     let output = run(&program, &["vss"], elsewhere.path());
     assert_eq!(String::from_utf8(output.stdout).unwrap(), "beside\nvss\n");

@@ -1,5 +1,5 @@
-//! The record of use: counted by the monitor over restarts, gaps and a new pack, and shown by report, export and
-//! passport.
+//! Tests the record of use: how long and how often temperatures, voltages and currents were beyond their limits. The
+//! monitor counts it over restarts, gaps and a new pack. Report, export and passport show it.
 
 use std::fs;
 use std::path::Path;
@@ -37,7 +37,7 @@ fn use_survives_restart_and_ends_with_pack() {
     near(before.temperature_c.above.beyond_s, 30.0, 0.5);
     near(before.temperature_c.above.known_s, 90.0, 1.5);
     assert_eq!((before.temperature_c.above.events, before.temperature_c.highest), (1, Some(50.0)));
-    // A missing limit is not judged.
+    // If a limit is missing, nothing is counted for it.
     assert_eq!((before.temperature_c.below.known_s, before.current_a.above.known_s), (0.0, 0.0));
     // While the sensor is silent, the temperature is unknown.
     rig.temperatures_c = [None; 2];
@@ -64,7 +64,7 @@ fn parking_at_high_soc_counts_over_known_downtime_only() {
     near(record(&rig).rest.above_90_s, 36_050.0, 3.0);
 }
 
-/// Temperature of the cell: 25 degrees C, and 50 degrees C for some minutes (degrees C).
+/// Temperature of the cell (degrees C): 25, except for some minutes at 50.
 fn temperature_c(second: u32) -> f64 {
     25.0 + f64::from(second.saturating_sub(600).min(1200_u32.saturating_sub(second)).min(25))
 }
@@ -129,7 +129,7 @@ fn report_export_and_passport_show_use_of_a_replay() {
     let events = condition["NegativeEvents"].as_array().unwrap();
     let texts: Vec<&str> = events.iter().map(|event| event["NegativeEventValue"].as_str().unwrap()).collect();
     let whats: Vec<_> = texts.iter().filter_map(|text| text.split_once(": 1 x, ")).map(|(what, _)| what).collect();
-    // The charge of 1.5 C lifts the voltage above that of the model's full cell.
+    // The charge at 1.5 C raises the voltage above that of a full cell in the model.
     let expected =
         ["temperature above its limit", "overcharge: cell voltage above its limit", "charging current above its limit"];
     assert_eq!(whats, expected, "{texts:?}");

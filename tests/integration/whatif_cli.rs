@@ -1,12 +1,11 @@
-//! Runs `packwatch whatif` as a user does: one replay for all alarm settings, and the alarms that each setting would
-//! have raised.
+//! Runs `packwatch whatif` as a user does. One replay must serve all alarm settings.
 
 use std::path::{Path, PathBuf};
 
 use assert_cmd::Command;
 use serde_json::Value;
 
-/// A capacity of 2.6 Ah that fades by 0.05 Ah per cycle falls below 80 % (2.08 Ah) after eleven cycles.
+/// With 2.6 Ah and a fade of 0.05 Ah per cycle, the capacity falls below 80 % (2.08 Ah) after eleven cycles.
 const CYCLES: &str = "12";
 
 struct Bench {
@@ -14,7 +13,6 @@ struct Bench {
 }
 
 impl Bench {
-    /// Two simulated lives with their truths.
     fn new() -> Self {
         let bench = Self { folder: tempfile::tempdir().unwrap() };
         for (name, seed) in [("a", "1"), ("b", "2")] {
@@ -52,8 +50,7 @@ fn grid_replay_equals_single_replays() {
     let choices = ["--set", "capacity_low.threshold=2.35,2.2", "--set", "capacity_low.probability=0.5,0.9", "--set"];
     let sweep = bench.whatif(&[&choices[..], &["soc_low.warning=0.35", "--end-of-life", "80 %", "a.log.gz"]].concat());
     assert_eq!((sweep["replays_per_log"].as_u64(), sweep["settings"].as_array().unwrap().len()), (Some(1), 5));
-    // A key outside the alarms forces a separate replay for each setting. With its default value, this key changes no
-    // result.
+    // Keys outside the alarms require a separate replay for each setting. This key has its default value.
     let alone = ["estimator.voltage_noise_v=0.005", "--end-of-life", "80 %", "a.log.gz"];
     let alone = bench.whatif(&[&choices[..], &["soc_low.warning=0.35", "--set"], &alone].concat());
     assert_eq!(alone["replays_per_log"], 2);
@@ -79,12 +76,12 @@ fn lead_times_follow_truth_file() {
         let raised = found["first"]["days"].as_f64().unwrap();
         assert!((found["lead_days"].as_f64().unwrap() - (end - raised)).abs() < 1e-9);
         assert_eq!((&found["missed"], &found["false_alarms"]), (&Value::Bool(false), &Value::from(0)));
-        // A lower threshold is never reached earlier.
+        // A lower threshold must not be reached earlier.
         let later = row(&document, log, 2)["first"]["days"].as_f64();
         assert!(later.is_none_or(|later| later >= raised), "{later:?} before {raised}");
     }
-    // If the cell never reaches its end of life (here 1.0 Ah), the same raises are false. If the horizon is also longer
-    // than the log, the raises are undecided.
+    // If the cell never reaches its end of life (here 1.0 Ah), the raises are false. If the horizon is also longer than
+    // the log, they are undecided.
     let healthy = [&set[..3], &["1.0", "a.log.gz"]].concat();
     let document = bench.whatif(&healthy);
     assert_eq!(row(&document, 0, 1)["false_alarms"], row(&document, 0, 1)["raises"]);

@@ -1,6 +1,5 @@
-//! Compares the Yocto recipe (`packaging/yocto`) with the sources. Every file that the recipe installs must exist. The
-//! recipe's version, units, licence checksums and build flags must match the repository. Whether bitbake accepts the
-//! recipe is checked by hand; see the manual, page Install.
+//! Compares the Yocto recipe (`packaging/yocto`) with the repository: installed files, version, units, licence
+//! checksums and build flags. Whether bitbake accepts the recipe is checked by hand (see the manual, page Install).
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -12,7 +11,6 @@ fn repository() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
 }
 
-/// File name and text of the only recipe.
 fn recipe() -> (String, String) {
     let folder = repository().join(LAYER).join("recipes-core/packwatch");
     let recipes: Vec<PathBuf> = fs::read_dir(folder)

@@ -1,7 +1,7 @@
-"""Databrokers for the test: a strict one, and the real one if PACKWATCH_DATABROKER names its program.
+"""Databrokers for the test: a strict one, and the real databroker if PACKWATCH_DATABROKER names its program.
 
-The strict one is built from kuksa-client's published stubs and records each violation of the protocol by the provider. Both
-serve the same VSS files, and kuksa-client reads both.
+The strict broker is built from kuksa-client's published stubs. It records each violation of the protocol by the
+provider.
 """
 
 import concurrent.futures
@@ -34,7 +34,7 @@ def type_number(name: str) -> int:
 
 
 def leaves(files: list[Path]) -> dict[str, dict]:
-    """Every signal of VSS files, by path. If several files contain a signal, the first one counts, as in the databroker."""
+    """Every signal of VSS files, by path. The first file that contains a signal counts, as in the databroker."""
     found: dict[str, dict] = {}
 
     def walk(path: str, node: dict) -> None:
@@ -51,7 +51,8 @@ def leaves(files: list[Path]) -> dict[str, dict]:
 
 
 class StrictBroker:
-    """Serves kuksa.val.v2 for a provider and for readers, and kuksa.val.v1 for readers. Aborts a call at its first violation."""
+    """Serves kuksa.val.v2 for a provider and for readers, and kuksa.val.v1 for readers. Aborts a call at its first
+    violation."""
 
     def __init__(self, port: int, files: list[Path], token: str | None = None, tls: tuple[bytes, bytes] | None = None,
                  twins: tuple[str, str] | None = None, is_stalled: bool = False):
@@ -72,10 +73,10 @@ class StrictBroker:
         self.changed = threading.Condition()
         self.provider: "queue.Queue | None" = None
         self.answers: queue.Queue = queue.Queue()
-        # The databroker 0.7 accepts no values while a request waits for its answer.
+        # While a request waits for its answer, databroker 0.7 accepts no values.
         self.lock = threading.Lock()
         self.pool = concurrent.futures.ThreadPoolExecutor(max_workers=16)
-        # A fixed window of 64 KiB limits what a provider can send to a broker that does not read.
+        # A fixed window of 64 KiB limits what a provider can send while the broker does not read.
         options = [("grpc.so_reuseport", 0), ("grpc.http2.bdp_probe", 0), ("grpc.http2.lookahead_bytes", 65_536)]
         self.server = grpc.server(self.pool, options=options)
         rpc_v2.add_VALServicer_to_server(V2(self), self.server)
@@ -111,7 +112,7 @@ class StrictBroker:
         return entry
 
     def fault(self, path: str, point: types_v2.Datapoint) -> str | None:
-        """What is wrong with a data point of this path, or None."""
+        """Returns what is wrong with a data point of this path, or None."""
         node = self.nodes[path]
         if not point.HasField("timestamp") or abs(point.timestamp.seconds - time.time()) > 60:
             return f"{path}: no current time stamp"
@@ -198,7 +199,8 @@ class V2(rpc_v2.VALServicer):
         outgoing.put(None)
 
     def GetValue(self, request, context):
-        """Like the databroker 0.7: returns the provider's answer or, after a second without an answer, the stored value.
+        """Like databroker 0.7, returns the provider's answer. After a second without an answer, returns the stored
+        value.
 
         A late answer is mistaken for the answer to the next request.
         """

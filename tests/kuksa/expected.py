@@ -1,5 +1,5 @@
-"""Expected value of each output, from the status document. Written independently of the program, to check signs, units and
-names."""
+"""Computes the expected value of each output from the status document, without the program's code, to check signs,
+units and names."""
 
 import struct
 
@@ -158,6 +158,6 @@ CELL_PERCENT = {
 
 
 def outputs(document):
-    """Value of every output by path; None = no value. Without a document no output has a value."""
+    """Value of every output by path; None: no value."""
     names = {STANDARD + name: value for name, value in standard(document).items()}
     return names | {OVERLAY + name: value for name, value in overlay(document).items()}

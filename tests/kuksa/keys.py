@@ -12,7 +12,7 @@ from cryptography.hazmat.primitives.asymmetric import ec, padding, rsa
 
 
 def self_signed(folder: Path, name: str = "databroker.test") -> tuple[Path, Path]:
-    """A self-signed certificate for `name`, and its key."""
+    """Creates a self-signed certificate for `name`, and its key."""
     key = ec.generate_private_key(ec.SECP256R1())
     subject = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, name)])
     now = datetime.datetime.now(datetime.timezone.utc)
@@ -28,7 +28,7 @@ def self_signed(folder: Path, name: str = "databroker.test") -> tuple[Path, Path
 
 
 def signed_tokens(folder: Path, scopes: dict[str, str]) -> tuple[Path, dict[str, str]]:
-    """A public key, and tokens (JWT, RS256) with these scopes."""
+    """Creates a public key, and tokens (JWT, RS256) with these scopes."""
     def encoded(data: bytes) -> bytes:
         return base64.urlsafe_b64encode(data).rstrip(b"=")
 

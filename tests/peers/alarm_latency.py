@@ -6,8 +6,8 @@ usage: alarm_latency.py alarm FILE COUNT   sends half-cycles to a daemon with th
        alarm_latency.py echo               runs such a program, as the lower bound of the time
        alarm_latency.py report FOLDER      prints and judges the results; also needs the daemon's files
 
-The times are written to FILE as {"late_ns": [...], ...}. After sending a frame this program sleeps before it looks for the
-answer, because with one CPU it would otherwise delay the answering program.
+The times are written to FILE as {"late_ns": [...], ...}. After sending a frame, this program sleeps before it looks for
+the answer. With one CPU it would otherwise delay the answering program.
 """
 import json
 import random
@@ -24,13 +24,14 @@ CELL, ALARM, ASK, ANSWER = 0x100, 0x6B2, 0x123, 0x321
 # Start and length of the alarm frame's bit fields, as in config/packwatch.dbc.
 RULE, STATE = (16, 5), (21, 3)
 CAPACITY_LOW, ACTIVE, CLEARED = 1, 1, 2
-# The first frame after 10 ms (min_duration_s of the configuration) confirms a new mode (charge or discharge).
+# The first frame after 10 ms (min_duration_s of the configuration) confirms a new mode.
 MODE_S = 0.012
 # In each half-cycle the current is almost zero except for one pulse. With the configuration's swing, a weak pulse gives a capacity
 # of 0.25 Ah, and a strong pulse 2.1 Ah.
 IDLE_A, WEAK_A, STRONG_A, PULSE_S = 0.008, 0.35, 3.0, 0.03
-# Ranges of the capacity (charge over swing) according to the frames' time stamps, Ah. A busy machine lengthens pulses and pauses.
-# If the capacity is near the alarm's thresholds, or impossible for a cell of 2.6 Ah, the half-cycle is not judged.
+# Ranges of the capacity (charge over swing), Ah. The charge follows from the frames' time stamps. A busy machine
+# lengthens pulses and pauses. If the capacity is then near the alarm's thresholds, or impossible for a cell of 2.6 Ah,
+# the half-cycle is not judged.
 SWING, WEAK_AH, STRONG_AH = 1.2e-5, (0.0, 0.8), (1.4, 4.0)
 # The first half-cycles have no complete predecessor.
 WARM_UP = 4
@@ -40,7 +41,7 @@ PEERS = {
     "player": "candump | sed | canplayer",
     "cansend": "candump | cansend for each frame",
 }
-# Delay of the first look for the answer, s, and maximum wait for the answer, s.
+# Time before the program looks for the answer, and maximum wait for the answer, s.
 LOOK_S, PATIENCE_S = 0.003, 2.0
 
 
@@ -67,8 +68,9 @@ def current_of(data):
 
 
 def last_half_cycle(cells, sign):
-    """Capacity (charge over swing, Ah) of the half-cycle before the latest change of sign, and the stamp of the frame that ended
-    this half-cycle: the second frame with the new sign. The stamp is None if a busy machine has not delivered that frame yet."""
+    """Returns the capacity (charge over swing, Ah) of the half-cycle before the latest change of sign, and the stamp of
+    the frame that ended it: the second frame with the new sign. The stamp is None if a busy machine has not delivered
+    that frame yet."""
     end = max((n for n, (_, current_a) in enumerate(cells) if current_a * sign < 0), default=-1) + 1
     begin = max((n for n, (_, current_a) in enumerate(cells[:end]) if current_a * sign > 0), default=-1) + 1
     frames = cells[begin : end + 1]
@@ -81,7 +83,7 @@ def bits(data, start, length):
 
 
 class Listener:
-    """Frames with these identifiers, with the kernel's stamps."""
+    """Receives the frames with these identifiers, with the kernel's stamps."""
 
     def __init__(self, *ids):
         self.socket = raw(*ids)
@@ -89,7 +91,7 @@ class Listener:
         self.socket.setblocking(False)
 
     def read(self):
-        """All received frames: [(ns, id, data)]."""
+        """Returns all received frames: [(ns, id, data)]."""
         seen = []
         while True:
             try:
@@ -101,7 +103,7 @@ class Listener:
             seen.append((seconds * 10**9 + nanoseconds, can_id, payload[:length]))
 
     def stamp_of(self, is_answer):
-        """(stamp of the first matching frame, or None after the maximum wait; all received frames)"""
+        """Returns (stamp of the first matching frame or None, all received frames)."""
         seen, deadline = [], time.monotonic() + PATIENCE_S
         time.sleep(LOOK_S)
         while True:
@@ -113,22 +115,23 @@ class Listener:
 
 
 def pause():
-    """Waits for a random time, to vary the phase relative to the other program's periods."""
+    """Waits for a random time, to vary the phase."""
     time.sleep(random.uniform(0.001, 0.011))
 
 
 def measure_alarm(count):
-    """Alternates strong and weak half-cycles: the end of each clears or raises the alarm."""
+    """Alternates strong and weak half-cycles. The end of a strong half-cycle clears the alarm. The end of a weak
+    half-cycle raises it."""
     listener, sender = Listener(CELL, ALARM), raw()
     late_ns, without, stalled, strong, sign = [], 0, 0, True, 1
-    # Number of half-cycles until the next one is judged. After a half-cycle with a wrong charge the alarm may not have changed,
-    # and then the next half-cycle cannot change it back.
+    # Number of half-cycles until the next one is judged. After a half-cycle with a wrong charge, the alarm may be
+    # unchanged. The next half-cycle then cannot change it back.
     wait, cells = WARM_UP, []
     while len(late_ns) + without < count:
         sender.send(cell(sign * IDLE_A))
         time.sleep(MODE_S)
         sender.send(cell(sign * IDLE_A))
-        # If a strong half-cycle begins now, the one that has just ended was weak, so it raises the alarm.
+        # If a strong half-cycle begins now, a weak half-cycle has just ended and raises the alarm.
         change = (CAPACITY_LOW, ACTIVE if strong else CLEARED)
         def is_answer(i, data, change=change):
             return i == ALARM and (bits(data, *RULE), bits(data, *STATE)) == change
@@ -148,7 +151,8 @@ def measure_alarm(count):
             print(f"no answer after {len(late_ns)}: {given_ah:.2f} Ah in {cells}", file=sys.stderr, flush=True)
         else:
             late_ns.append(answered - asked)
-        # Between two frames the daemon interpolates the current linearly, so each edge of a pulse takes two frames.
+        # Between two frames, the daemon interpolates the current linearly. Each edge of a pulse therefore takes two
+        # frames.
         pulse_a = STRONG_A if strong else WEAK_A
         for current_a in (IDLE_A, pulse_a):
             sender.send(cell(sign * current_a))
@@ -189,9 +193,8 @@ def at(late_ns, share):
 
 
 def decided_by_frame(folder, late_ns):
-    """Keeps the results of the alarms that a frame triggered. The daemon also checks the clock ten times a second; if a check falls
-    between the two frames, the check confirms the mode. The daemon's events contain the time of the input at which each alarm
-    changed."""
+    """Keeps only the alarms that a frame triggered. The daemon also checks the clock ten times a second. If a check
+    falls between the two frames, the check confirms the mode instead of a frame."""
     stamp = re.compile(r"^\((\d+)\.(\d{9})\)", re.MULTILINE)
     frames = {int(a + b) for a, b in stamp.findall((folder / "watched.journal").read_text())}
     events = map(json.loads, (folder / "watched.events").read_text().splitlines())

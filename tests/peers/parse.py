@@ -1,4 +1,4 @@
-"""The Python peer of parsing and decoding: python-can's log reader and cantools.
+"""The Python peer of the parsing comparison: python-can's log reader and cantools.
 
 parse.py LOG DBC [FRAMES]      prints: frames sum seconds
 """

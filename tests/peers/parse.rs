@@ -1,8 +1,7 @@
-//! Packwatch's part of the parsing comparison with `parse.c` and `parse.py`: reads blocks of the file, splits lines,
-//! parses frames and decodes DBC signals.
+//! Packwatch's part of the parsing comparison with `parse.c` and `parse.py`. Uses the readers of `packwatch replay` up
+//! to the sample stage, and an [`InputMap`] with every signal of the DBC.
 //!
-//! `cargo run --release --example parse -- LOG DBC [FRAMES]` prints: frames, sum of all values, seconds. It uses the same
-//! readers as `packwatch replay` up to the sample stage, and an [`InputMap`] with every signal of the DBC.
+//! `cargo run --release --example parse -- LOG DBC [FRAMES]` prints frames, sum of all values, and seconds.
 #![expect(clippy::print_stdout, reason = "a program whose output is read by tests/peers/run")]
 #![expect(clippy::unwrap_used, reason = "a bench panics if its setup fails")]
 
@@ -26,7 +25,7 @@ fn main() {
     println!("{frames} {sum:.6} {:.6}", start.elapsed().as_secs_f64());
 }
 
-/// Binds every signal to a separate channel; the kind of channel does not matter here.
+/// Assigns every signal to a separate channel. The kind of channel does not matter here.
 fn every_signal(dbc: &str) -> InputMap {
     let database = Database::parse(dbc).unwrap();
     let signals =

@@ -2,10 +2,10 @@
 
 replay.py LOG CONFIG SOCS      prints: frames steps seconds; writes the SOC after each step to SOCS, one number per line
 
-The filter is the same as in src/core/cell/estimator.rs: states [SOC, U1, ln rho, C], and the same tables, circuit, process and measurement
-noises (defaults of docs/src/reference/keys.md). The sigma points come from filterpy's own class and are redrawn before the update.
-The peer has less work than packwatch, because it omits the gate, the consistency check, learning at transitions, alarms and sent
-frames. A gap in the current ends the peer with an error.
+The filter is that of src/core/cell/estimator.rs: states [SOC, U1, ln rho, C], with the same tables, circuit, process
+and measurement noises (defaults of docs/src/reference/keys.md). filterpy's own class gives the sigma points, and they
+are redrawn before the update. The peer omits the gate, the consistency check, learning at transitions, alarms and sent
+frames.
 """
 import bisect
 import math
@@ -49,7 +49,7 @@ class Model:
         self.rows = {}
 
     def at(self, temperature_c):
-        """(OCV, R0, R1, tau) over SOC at a temperature; cached, because sensor values repeat."""
+        """(OCV, R0, R1, tau) over SOC at a temperature. Cached because sensor values repeat."""
         if temperature_c not in self.rows:
             t = min(max(bisect.bisect_right(self.temperature_c, temperature_c) - 1, 0), len(self.temperature_c) - 2)
             low_c, high_c = self.temperature_c[t:t + 2]
@@ -63,7 +63,7 @@ class Model:
         return self.rows[temperature_c]
 
     def place(self, soc):
-        """Index of the table interval, position in it, and this position limited to 0 to 1."""
+        """Index of the table interval, relative position in it, and this position limited to 0 to 1."""
         grid = self.soc
         s = min(max(bisect.bisect_right(grid, soc) - 1, 0), len(grid) - 2)
         beyond = (soc - grid[s]) / (grid[s + 1] - grid[s])
@@ -179,7 +179,7 @@ class Pack:
                     self.temperature_c[cell] = value
 
     def flow(self, time_s, current_a):
-        """Integrates the charge by the trapezoidal rule between two readings."""
+        """Adds the charge since the last reading, by the trapezoidal rule."""
         if self.current_at is not None:
             dt_s = time_s - self.current_at
             if dt_s > self.max_age_s:

@@ -1,4 +1,4 @@
-"""Shared by run, scaling and profile: paths, the peers' Python, tables, the results in tests/speed.md."""
+"""Shared by run, scaling and profile: paths, the peers' Python, tables, and the results in tests/speed.md."""
 import os
 import re
 import subprocess
@@ -23,8 +23,8 @@ def install():
 
 
 def python(*modules):
-    """The first interpreter that has the modules: from `--install`, PACKWATCH_PYTHON, or the running one. None if all lack
-    them."""
+    """Returns the first interpreter that has the modules (from `--install`, PACKWATCH_PYTHON, or the running one), or
+    None."""
     for interpreter in (VENV / "bin/python3", os.environ.get("PACKWATCH_PYTHON", sys.executable)):
         command = [str(interpreter), "-c", "import " + ", ".join(modules)]
         try:
@@ -36,7 +36,7 @@ def python(*modules):
 
 
 def output(*command, **options):
-    """Standard output of a command. If the command fails, exits with its error output."""
+    """Returns the standard output of a command. If the command fails, exits with its error output."""
     run = subprocess.run([str(part) for part in command], text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options)
     if run.returncode != 0:
         sys.exit(f"{' '.join(map(str, command))}\nfailed, status {run.returncode}: {run.stderr.strip()[-2000:]}")
@@ -61,13 +61,13 @@ def machine():
 
 
 def table(header, rows):
-    """A Markdown table; columns after the first are numbers."""
+    """A Markdown table. All columns after the first contain numbers."""
     lines = [header, ["---"] + ["---:"] * (len(header) - 1)] + rows
     return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines) + "\n"
 
 
 def publish(name, command, text):
-    """Replaces the block of that name in tests/speed.md."""
+    """Replaces the block with this name in tests/speed.md."""
     begin, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->\n"
     block = f"{begin}`{command}` ({machine()})\n\n{text.strip()}\n{end}"
     before = SPEED.read_text()

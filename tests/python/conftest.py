@@ -1,6 +1,6 @@
 """Shared by the tests: the program, its configurations, a simulated record, and measured data if available.
 
-PACKWATCH_BIN: the program, default target/debug/packwatch. PACKWATCH_DATA: measured data; without it, tests that need it are
+PACKWATCH_BIN: the program, default target/debug/packwatch. PACKWATCH_DATA: measured data. Without it, some tests are
 skipped.
 """
 
@@ -24,7 +24,7 @@ START_S = 1_700_000_000
 
 @dataclass(frozen=True)
 class Record:
-    """A simulated cell of config/paper.toml."""
+    """The record of a simulated cell (config/paper.toml)."""
 
     log: Path
     csv: Path
@@ -36,7 +36,7 @@ class Record:
 
 
 def packwatch(*arguments, code: int = 0) -> str:
-    """Standard output of the program or, if it is expected to fail, its standard error."""
+    """Returns the program's standard output. If it is expected to fail, returns its standard error."""
     done = subprocess.run([BINARY, *map(str, arguments)], capture_output=True, text=True, timeout=120)
     assert done.returncode == code, done.stderr
     return done.stdout if code == 0 else done.stderr
@@ -59,7 +59,7 @@ def record(tmp_path_factory) -> Record:
 
 @pytest.fixture(scope="session")
 def data() -> Path:
-    """Measured data."""
+    """The folder of measured data."""
     if "PACKWATCH_DATA" not in os.environ:
         pytest.skip("no measured data (PACKWATCH_DATA)")
     return Path(os.environ["PACKWATCH_DATA"])
@@ -70,7 +70,7 @@ class Interrupt(Exception):
 
 
 def interrupted(call: Callable[[], object], after_s: float = 0.3) -> float:
-    """Calls, and interrupts with a signal whose handler raises, as Ctrl-C does. Returns the seconds from the signal to the end
+    """Calls `call` and interrupts it with a signal whose handler raises. Returns the seconds from the signal to the end
     of the call."""
 
     def handle(*_):
@@ -89,7 +89,7 @@ def interrupted(call: Callable[[], object], after_s: float = 0.3) -> float:
 
 
 def read_csv(path: Path) -> dict[str, list]:
-    """Columns of a CSV of estimates as the program writes it; an empty field is NaN."""
+    """Columns of a CSV of estimates that the program wrote. An empty field is NaN."""
     lines = path.read_text().splitlines()
     rows = [line.split(",") for line in lines[1:]]
     value = lambda text: {"": float("nan"), "true": True, "false": False}.get(text) if text in ("", "true", "false") else float(text)  # noqa: E731
@@ -97,7 +97,7 @@ def read_csv(path: Path) -> dict[str, list]:
 
 
 def assert_same_estimates(table, path: Path) -> None:
-    """Checks that the table has the columns and every bit of a CSV that the program wrote."""
+    """Checks that the table equals a CSV that the program wrote, in every bit."""
     expected = read_csv(path)
     assert table.column_names == list(expected)
     assert len(table) == len(expected["time_s"]) > 0

@@ -1,4 +1,4 @@
-"""The Python functions of the commands give the same bytes and files as the commands, and exceptions with the same text."""
+"""Tests the Python functions of the commands against the commands: bytes, files, and texts of exceptions."""
 
 import errno
 import json
@@ -32,7 +32,7 @@ def test_every_score_case_has_a_plot(record, tmp_path):
 
 
 def assert_last_argument_counts(file, given, options, **known):
-    """The call equals the command with these options, and differs without the last argument."""
+    """The call must equal the command with these options. Without the last argument, its result must differ."""
     files = [word for option, path in known.items() for word in (f"--{option}", path)]
     score = pw.score(file, **known, **given)
     assert score.json() == packwatch("score", file, *files, *options.split(), "--json")

@@ -1,5 +1,5 @@
-"""Tests that `read` reads packwatch's CSV, and files that the package of the Battery Data Format writes. In these files, a positive
-current is a charge."""
+"""Tests `read` on packwatch's CSV and on files of the Battery Data Format, written by that format's own package. In
+these files, a positive current is a charge."""
 
 import bdf
 import numpy as np

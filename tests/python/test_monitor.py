@@ -1,5 +1,5 @@
-"""Rows and frames given to a Monitor, in one call or in portions, produce the results of a replay. Bad input raises an exception
-that names the fault."""
+"""Tests that a Monitor produces the results of a replay from rows or frames, and that bad input raises a named
+fault."""
 
 import os
 import re
@@ -386,7 +386,7 @@ def test_monitor_is_unusable_after_internal_failure():
             except pw.DataError as error:
                 print(error)
     """)
-    # No thread can have a stack of this size, so starting a thread panics.
+    # No thread can have a stack of this size, so a call that starts a thread panics.
     environment = os.environ | {"RUST_MIN_STACK": str(2**62)}
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, env=environment)
     text = "an earlier call failed inside packwatch; create a new Monitor"

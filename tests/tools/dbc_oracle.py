@@ -15,7 +15,7 @@ import sys
 
 
 def last_byte(start, length, big_endian):
-    """The highest byte that contains one of the signal's bits, counted from its start bit."""
+    """Returns the highest byte that contains one of the signal's bits, counted from its start bit."""
     bit, highest = start, start // 8
     for _ in range(length - 1):
         if not big_endian:
@@ -44,8 +44,8 @@ def reaches_past(path):
 def load(path, strict):
     """The DBC as cantools reads it, with the file's own names.
 
-    If a file gives long names (over 32 characters), cantools renames a multiplexor but not the references to it in the dependent
-    signals, and then cannot decode these signals. The attributes with the long names are therefore removed.
+    If a file gives long names (over 32 characters), cantools renames a multiplexor but not the references to it, and
+    cannot decode the dependent signals. Therefore the attributes with the long names are removed.
     """
     import cantools
 
@@ -93,7 +93,7 @@ def about(path, strict):
         attributes = m.dbc.attributes
 
         def value(name):
-            """The attribute's word or number; a dash if it has the default."""
+            """The attribute's word or number, or a dash if it has the default."""
             found = attributes.get(name)
             if found is None:
                 return "-"

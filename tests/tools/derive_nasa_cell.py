@@ -1,17 +1,18 @@
 #!/usr/bin/env python3
 """Makes a cell model of a NASA PCoE 18650 from its first cycles: derive_nasa_cell.py CELL.csv.gz OUT.toml [--name NAME]
 
-Reads cycles 0..LAST only (five discharges, five charges); the model does not use the rest of the life.
-One RC branch at a fixed time constant makes the voltage linear in the table values:
+Reads only cycles 0..LAST (five discharges, five charges); the model does not use the rest of the life.
+With one RC branch of fixed time constant, the voltage is linear in the table values:
 
     V(t) = sum_j OCV_j h_j(s) - sum_j R0_j h_j(s) I - sum_j R1_j u_j(t),   tau du_j/dt = h_j(s) I - u_j
 
-with s the SOC, h_j the hat function of point j of its grid, I the current (positive = discharge) and u_j the current of the branch at
-point j. One bounded least-squares problem therefore gives all tables. Between two anchors, the SOC is counted in ampere-hours. The
-anchors are the end of every full charge (SOC 1, the state in which this charger leaves the cell) and the knee of each discharge (3.0 V
-under load), which has the same SOC in all discharges. This keeps two errors out of the
-curves: the cycle-to-cycle fade, and the charger's current-gain error (its ampere-hours exceed the discharge's by 1 %).
-Needs numpy and scipy. Deterministic.
+Here s is the SOC, h_j the hat function of point j of its grid, I the current (positive = discharge) and u_j the current
+Here s is the SOC, h_j the hat function of point j of its grid, I the current (positive = discharge) and u_j the current
+of the branch at point j. One bounded least-squares problem therefore gives all tables. Between two anchors, the SOC is
+counted in ampere-hours. The anchors are the end of every full charge (SOC 1) and the knee of each discharge (3.0 V
+under load), which has the same SOC in all discharges. These anchors keep two errors out of the curves: the
+cycle-to-cycle fade, and the charger's current-gain error (its ampere-hours exceed those of the discharge by 1 %). Needs
+numpy and scipy.
 """
 import argparse
 import csv
@@ -21,19 +22,19 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 LAST_CYCLE = 10           # cycle 9 is the fifth discharge, cycle 10 the charge after it
-TAU_S = 60.0              # 30 to 120 s fit alike, 10 and 300 s worse; a second branch gains nothing here
-SOC_LEFT = 0.045          # SOC left at 2.7 V under 2 A when new: the data end there, OCV(0) = 2.7 V is extrapolated
+TAU_S = 60.0              # 30 to 120 s fit equally well, 10 and 300 s worse; a second branch does not improve the fit here
+SOC_LEFT = 0.045          # SOC left at 2.7 V under 2 A in a new cell; the data end there, and OCV(0) = 2.7 V is extrapolated
 KNEE_V = 3.0
-MIN_SLOPE, TOP_SLOPE = 0.2, 1.0   # V per unit SOC, the second above SOC 0.9: otherwise slow relaxation would bend the top down
+MIN_SLOPE, TOP_SLOPE = 0.2, 1.0   # V per unit SOC; TOP_SLOPE above SOC 0.9, where slow relaxation would otherwise bend the curve down
 VOLTAGE_MIN, VOLTAGE_MAX = 2.7, 4.2
 SOC = np.array([0, .03, .045, .06, .075, .09, .105, .12, .14, .17, .2, .25, .3, .4, .5, .6, .7, .75, .8, .85, .9, .93, .96, .98, 1])
-AGEING_SHIFT = 0.5        # not fitted, because a new cell does not show it; between uniform shrinking (0) and pure lithium loss (1)
+AGEING_SHIFT = 0.5        # not fitted because a new cell does not show it; between uniform shrinking (0) and pure lithium loss (1)
 CHARGE_WEIGHT = 0.6       # per second, relative to discharge
 SMOOTH_OCV, SMOOTH_R0, SMOOTH_R1 = 0.0005, 0.5, 0.02
 
 
 def read_cycles(path):
-    """[(type, time, current, voltage, temperature)], with time counted within each cycle only."""
+    """[(type, time, current, voltage, temperature)]; the time is counted within each cycle."""
     rows = {}
     with gzip.open(path, "rt") as f:
         for r in csv.DictReader(f):
@@ -50,7 +51,7 @@ def ampere_hours(t, i):
 
 
 def with_soc(cycles):
-    """SOC for every sample. The first charge (partial, with unknown start) serves only to reach a full cell."""
+    """SOC of every sample. The first charge is partial and begins at an unknown SOC, so it only gives a full cell."""
     def knee(t, i, v):
         n = np.flatnonzero((v <= KNEE_V) & (i > 1))[0]
         q = ampere_hours(t, i)
@@ -99,7 +100,7 @@ def fit(records):
             e = np.exp(-(t[k] - t[k - 1]) / TAU_S)
             u[k] = e * u[k - 1] + (1 - e) * (i[k] * h[k] + i[k - 1] * h[k - 1]) / 2
         keep = (v > 0.5) & (v < 5) & (np.abs(np.diff(i, prepend=i[0])) < 0.5)
-        keep &= ~((kind == "discharge") & (i < 1) & (s < 0.5))    # recovery after the cut-off: slower than one branch
+        keep &= ~((kind == "discharge") & (i < 1) & (s < 0.5))    # skip the recovery after the cut-off, which is slower than one branch
         a.append(np.hstack([h, -h * i[:, None], -u]))
         y.append(v)
         w.append(np.sqrt(np.clip(np.gradient(t), 0, 20)) * keep * (1.0 if kind == "discharge" else CHARGE_WEIGHT))
@@ -124,8 +125,8 @@ def fit(records):
 
 
 def fit_thermal(records, r_total):
-    """(heat capacity, thermal resistance) from dT/dt = (I^2 R - (T - T_start)/Rth)/Cth over the discharges, integrated.
-    Reversible heat is neglected, so these are effective values for this load."""
+    """(heat capacity, thermal resistance) from dT/dt = (I^2 R - (T - T_start)/Rth)/Cth, integrated over the discharges.
+    Reversible heat is neglected, so the values are effective values for this load."""
     rows, rhs = [], []
     for kind, t, i, v, temp, s in records:
         if kind != "discharge":

@@ -8,8 +8,8 @@ usage: e2e_oracle.py   reads lines `profile data_id raw ours flipped` with paylo
                          peer      `raw` as the peer protects it
                          ours?     1 if the peer accepts `ours`, otherwise 0
                          flipped?  1 if the peer accepts `flipped`, otherwise 0
-                       The first three words are by autosar-e2e, which advances the counter itself. The others are by cantools, only
-                       in profile 5 and from 4 bytes on. cantools does not advance the counter, so its `raw` gets our counter.
+                       autosar-e2e gives the first three words; it advances the counter itself. cantools gives the other words, only
+                       in profile 5 and from 4 bytes on. cantools does not advance the counter, so its `raw` gets packwatch's counter.
 """
 import sys
 

@@ -1,5 +1,5 @@
-"""Runs scikit-learn's Gaussian process regression with an exponential kernel and fixed hyperparameters, as the reference for
-tests/integration/gp_peer.rs.
+"""Runs scikit-learn's Gaussian process regression with an exponential kernel and fixed hyperparameters. It is the
+reference for tests/integration/gp_peer.rs.
 
 Reads one command per line from standard input; each answer is one line on standard output:
   make N DIR   draws N rows of 3 inputs and 2000 queries, writes DIR/rows.f64 (inputs, targets, queries; little endian)

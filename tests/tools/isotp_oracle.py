@@ -21,7 +21,7 @@ def layer(address: isotp.Address, inbox: deque, outbox: deque) -> isotp.Transpor
 
 
 def frames_of(message: bytes) -> list[bytes]:
-    """The sender's frames, with a receiver that sends flow control."""
+    """Returns the sender's frames. A receiver sends the flow control."""
     to_receiver, to_sender, frames = deque(), deque(), []
     sender, receiver = layer(SENDER, to_sender, to_receiver), layer(RECEIVER, to_receiver, to_sender)
     sender.send(message)

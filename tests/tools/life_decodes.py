@@ -2,16 +2,16 @@
 
 usage: life_decodes.py FILE.dbc FRAMES.log ESTIMATES.csv EVENTS.jsonl RATED_AH
 
-FRAMES, ESTIMATES and EVENTS come from `packwatch replay`, FILE.dbc from `packwatch dbc` with the same configuration. The
-expected values are computed independently:
+FRAMES, ESTIMATES and EVENTS come from `packwatch replay`, FILE.dbc from `packwatch dbc` with the same configuration.
+The expected values are computed independently:
 
 - status frame: from the mode, signal, trust, gap and alarm events, and from the estimates. `Life.combined` computes the
   pack's values from the estimates of the cells
 - health frame: from the capacity, loss mode, remaining life and recharge events, and from the estimates
 - alarm and digest frames: from the alarm events
 
-Every value must agree within one bit; unknown values must be sent as unknown. The last line is a JSON document with the
-comparison; the exit status is 0 only if all values agree.
+Every value must agree within one bit, and unknown values must be sent as unknown. The last line is a JSON document with
+the comparison. The exit status is 0 only if all values agree.
 """
 import csv
 import json
@@ -43,7 +43,7 @@ class Reader:
                 self.unavailable[key] = {code for code, word in words.items() if str(word) == "not available"}
 
     def decode(self, frame_id, data):
-        """(name of the message, {signal: value, None for not available})"""
+        """Returns (name of the message, {signal: value}). The value is None if it is not available."""
         message = self.database.get_message_by_frame_id(frame_id)
         raw = message.decode(data, decode_choices=False, scaling=False)
         name = message.name.removeprefix("PACKWATCH_")
@@ -58,13 +58,13 @@ class Reader:
         return self.signals["PACKWATCH_" + message, signal].scale
 
     def clip(self, message, signal, value):
-        """The value limited to the signal's range."""
+        """Returns the value limited to the signal's range."""
         found = self.signals["PACKWATCH_" + message, signal]
         return min(max(value, float(found.minimum)), float(found.maximum))
 
 
 class Life:
-    """The replay's reports up to a given time."""
+    """The state of the pack according to the replay's reports up to a given time."""
 
     def __init__(self, cells, rated_ah):
         self.cells, self.rated_ah = cells, rated_ah
@@ -76,13 +76,13 @@ class Life:
         self.pack = None
         self.mode = "unknown"
         self.bad, self.untrusted = set(), set()
-        self.changed = {}  # all alarms by (rule, cell, severity): the last event, raised or not
-        self.alarms = {}  # raised alarms by (rule, cell, severity): the last event
+        self.changed = {}  # last event of every alarm, by (rule, cell, severity)
+        self.alarms = {}  # last event of every raised alarm, by (rule, cell, severity)
         self.recharge = None  # the last reported period
         self.normalised = None
         self.life = dict.fromkeys(("RemainingCycles", "RemainingCyclesLow", "RemainingDays"))
         self.losses = {}  # by cell: signals of its loss modes
-        self.moved = set()  # cells whose state changed at a mode change after their last row
+        self.moved = set()  # cells without a new row since the last mode change, which changed their state
 
     def take_estimate(self, row):
         cell = int(row["cell"])
@@ -186,12 +186,12 @@ def nanos(text):
 
 
 def frames(path):
-    """(time, identifier, data) of each line, classic or FD."""
+    """Yields (time, identifier, data) of each line, classic or FD."""
     with open(path) as lines:
         for line in lines:
             stamp, _, frame = line.split()
             number, data = frame.split("#", 1)
-            # CAN FD: a second # and a digit of flags.
+            # CAN FD has a second # and a digit of flags.
             yield nanos(stamp[1:-1]), int(number, 16), bytes.fromhex(data[2:] if data.startswith("#") else data)
 
 
@@ -202,7 +202,7 @@ class Comparison:
         self.faults, self.printed = 0, []
         self.counters = {}
         self.unreported = 0  # recharge periods without an event in the log
-        # Number of resistances that cannot be compared: at a mode change, the current's offset is learned, which changes a
+        # Resistances that cannot be compared: at a mode change the monitor learns the current's offset, which changes a
         # resistance before the next rows report it.
         self.restated = 0
 
@@ -221,7 +221,7 @@ class Comparison:
                 self.fault(time, message, f"{signal} is {found}, must be {wanted}")
 
     def counter(self, time, message, values):
-        """Checks that a protected message counts its frames, to 14 (profile 1) or 255 (profile 5)."""
+        """Checks that a protected message counts its frames, up to 14 (profile 1) or 255 (profile 5)."""
         if "E2eCounter" not in values:
             return
         last = self.counters.get(message)
@@ -261,9 +261,8 @@ def compare(reader, life, estimates, events, frame_list):
             for signal, wanted in life.health().items():
                 if signal in values:
                     if signal == "RechargePeriod" and values[signal] is not None:
-                        # The recharge period is the time that a charge takes through a window of SOC. The frame
-                        # contains the new period as soon as the SOC passes the window's upper end. The event follows at
-                        # the end of the charge, if the log contains that end.
+                        # As soon as the SOC passes the upper end of the recharge window, the frame contains the new
+                        # period. The event follows at the end of the charge, if the log contains that end.
                         coming = periods[done] if done < len(periods) else None
                         if coming is not None and abs(values[signal] - coming) <= 1:
                             wanted = coming
@@ -292,15 +291,16 @@ def compare_digest(result, life, time, values):
 
 
 def compare_alarm(result, life, time, values, pending):
-    """The first frame after an alarm event must match that event. The other frames repeat alarms that are raised or unknown,
-    or that changed earlier."""
+    """The first frame after an alarm event must match that event. All other frames repeat alarms that are raised or
+    unknown, or that changed earlier."""
     rule, cell = result.rules[values["Rule"]], values["Cell"]
     severity = {number: word for word, number in SEVERITIES.items()}[values["Severity"]]
     name = next(signal for signal in values if signal.startswith("Value_"))
     threshold = name.replace("Value_", "Threshold_")
     factor = 100 if result.reader.signals["PACKWATCH_Alarm", name].unit == "%" else 1
     key = rule, cell, severity
-    # If more alarms change than the frame budget allows, their frames are sent one after another, each with the alarm's present state.
+    # If more alarms change than the frame budget allows, their frames follow one after another, each with the present
+    # state.
     waiting = [(at, e) for at in pending if time - WAIT_NS <= at <= time for e in pending[at] if (e["rule"], e["cell"], e["severity"]) == key]
     at_once = waiting[-1][1] if waiting else None
     result.value(time, "Alarm", "Test", values["Test"], 0)
@@ -318,15 +318,14 @@ def compare_alarm(result, life, time, values, pending):
         result.value(time, "Alarm", "Acknowledged", values["Acknowledged"], event["acknowledged"])
         result.value(time, "Alarm", threshold, values[threshold], factor * event["threshold"])
     elif values["State"] == STATES["unknown"]:
-        # The alarm is not raised, and it is unknown whether it should be.
+        # The alarm is not raised, but the daemon does not know whether it should be.
         result.value(time, "Alarm", name, values[name], None)
         result.frames["Alarm unknown"] += 1
     elif key in life.changed:
-        # A repetition of a cleared alarm.
         result.value(time, "Alarm", "State", values["State"], STATES[life.changed[key]["state"]])
         result.frames["Alarm repeated"] += 1
     elif values["State"] == STATES["inactive"]:
-        # The alarm was announced as unknown and is known again.
+        # The alarm was announced as unknown before.
         result.frames["Alarm known again"] += 1
     else:
         result.fault(time, "Alarm", f"{key} was sent but is not raised")

@@ -3,11 +3,11 @@
 
 usage: look_at_page.py CHROMIUM PAGE.html|URL WIDTH HEIGHT light|dark [SHOT.png] [PRINT.pdf]
 
-For a URL, answers JavaScript expressions first: one per line on standard input, one line of JSON each on standard output. The
-expression `shot FILE.png` takes a picture.
+If PAGE is a URL, first answers JavaScript expressions: one expression per line on standard input, one line of JSON per
+answer on standard output. The expression `shot FILE.png` takes a picture.
 
-Prints one JSON document: requests (other than the page itself), messages, overflow_px (excess width of the page over the
-window). Speaks the DevTools protocol over a pipe; needs only Python's standard library.
+Prints one JSON document: requests (other than the page itself), messages, overflow_px (excess width of the page over
+the window). Uses the DevTools protocol over a pipe and needs only Python's standard library.
 """
 import base64
 import json
@@ -98,7 +98,7 @@ def look(browser, page, width, height, scheme, shot, print_to):
         data = browser.call("Page.printToPDF", printBackground=True, preferCSSPageSize=True)["data"]
         pathlib.Path(print_to).write_bytes(base64.b64decode(data))
     asked = [e["params"]["request"]["url"] for e in browser.events if e["method"] == "Network.requestWillBeSent"]
-    # `data:` URLs are part of the page: nothing is fetched.
+    # A `data:` URL is part of the page, so nothing is fetched.
     asked = [address for address in asked if address != url and not address.startswith("data:")]
     kinds = ("Log.entryAdded", "Runtime.consoleAPICalled", "Runtime.exceptionThrown")
     said = [e["params"] for e in browser.events if e["method"] in kinds]

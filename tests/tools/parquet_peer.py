@@ -25,7 +25,7 @@ def read(path):
 
 
 def same(value, text):
-    """Whether a value equals the CSV's text."""
+    """Whether a value equals the text in the CSV."""
     if value is None:
         return text == ""
     if isinstance(value, bool):

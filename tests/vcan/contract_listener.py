@@ -1,4 +1,5 @@
-"""An independent ECU that listens to packwatch and keeps the table of raised alarms. It follows only the DBC and docs/src/ecu/contract.md.
+"""An independent ECU that listens to packwatch and keeps the table of raised alarms. It uses only the DBC and
+docs/src/ecu/contract.md.
 
     listener = ContractListener("out.dbc", loss=0.1, seed=1)
     listener.handle(time_s, frame_id, data)     call this for each frame of the bus; ignores a random part (`loss`) of them
@@ -18,7 +19,7 @@ WHOLE_PACK = 2047
 
 
 def checksum(table):
-    """The sum of the CRC-16 of all entries."""
+    """Returns the sum of the CRC-16 of all entries."""
     total = 0
     for (rule, severity, cell), (state, acknowledged) in table.items():
         entry = bytes([rule, severity, cell & 0xFF, cell >> 8, state + 8 * acknowledged])

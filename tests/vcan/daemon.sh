@@ -7,8 +7,8 @@ packwatch=${PACKWATCH_BIN:?names the program under test}
 config=$tmp/config
 cp -r "$(dirname "${BASH_SOURCE[0]}")/../../config" "$config"
 
-# daemon NAME CONFIG ARGS...: runs without control socket, status socket and state folder unless ARGS name them, because a
-# packwatch installed on this machine may use the default ones.
+# daemon NAME CONFIG ARGS...: runs without control socket, status socket and state folder unless ARGS name them. An
+# installed packwatch may use the default ones.
 daemon() {
     local name=$1 file=$2 base=$tmp/$1
     shift 2
@@ -28,14 +28,14 @@ daemon_stopped() {
 # Whether NAME's log has at least COUNT lines with the expression.
 logged_times() { (($(grep -cE -- "$2" "$tmp/$1.log") >= $3)); }
 
-# Whether NAME's journal has a line with the expression. Lines reach the disk within a second.
+# Whether NAME's journal has a line with the expression.
 journalled() { grep -qE -- "$2" "$tmp/$1.journal"; }
 journalled_times() { (($(grep -cE -- "$2" "$tmp/$1.journal") >= $3)); }
 
-# ID#DATA of the frames on an interface in a candump log or journal.
+# frames_of FILE INTERFACE: prints ID#DATA of the frames in a candump log or journal.
 frames_of() { awk -v on="$2" '$1 ~ /^\(/ && $2 == on { print $3 }' "$1"; }
 
-# sum_of FILE EXPRESSION: sum of the last words of all matching lines, for example of dropped frames or of frames not sent.
+# sum_of FILE EXPRESSION: sum of the last words of all matching lines.
 sum_of() { awk -v wanted="$2" '$0 ~ wanted { n += $NF } END { print n + 0 }' "$1"; }
 
 # replayed NAME CONFIG ARGS...: a replay of NAME's journal must give NAME's frames and events, byte for byte.
@@ -49,10 +49,10 @@ replayed() {
     done
 }
 
-# restart_bar LOG...: allowed SOC difference, in points, between a restarted daemon and one that kept running. If all restarts
-# took at most 2.5 s (see the logs), 0.2 points are allowed. Otherwise the allowed difference is the SOC change that the drive's
-# largest current causes during the longest restart: 6.2 A of 2.6 Ah are 0.066 points a second. A tenth of this and 0.02 points are
-# added for the time between the last sample and the state's time stamp.
+# restart_bar LOG...: prints the allowed SOC difference, in points, between a restarted daemon and a daemon that kept
+# running. If all restarts took at most 2.5 s, 0.2 points are allowed. Otherwise, the largest SOC change during the
+# longest restart is allowed: 6.2 A of 2.6 Ah are 0.066 points a second. A tenth of this and 0.02 points are added for
+# the time between the last sample and the state's time stamp.
 restart_bar() {
     cat -- "$@" | sed -nE 's/.*state (taken up|restored).* away=([0-9.]+).*/\2/p' |
         awk '$1 > away { away = $1 } END { print (away > 2.5 ? 0.073 * away + 0.02 : 0.2) }'

@@ -3,7 +3,7 @@
 
     ecu.py INTERFACE [--answers DID=HEX ...]     requests on 7E4, answers on 7EC, until SIGTERM
 
-A request for an unknown identifier is rejected with 0x31. Prints "ready", then each request.
+Rejects a request for an unknown identifier with 0x31. Prints "ready", then each request.
 """
 
 import argparse

@@ -30,7 +30,7 @@ AWAY = {errno.ENETDOWN, errno.ENXIO, errno.ENODEV, errno.ENOBUFS}
 
 
 def frames(lines, interface="vcan0"):
-    """Identifier and payload of candump's lines for an interface."""
+    """Yields identifier and payload of candump's lines for an interface."""
     for line in lines:
         words = line.split()
         if len(words) == 3 and words[0].startswith("(") and words[1] == interface and words[2].count("#") == 1:
@@ -87,8 +87,8 @@ class Truth:
                 self.samples[-1].append(float(words[column]))
 
     def errors(self, lines, after: int = -1) -> list[tuple[float, float]]:
-        """Error and stated deviation of the estimates on the bus, from sample `after` on. Each error is reduced by
-        the largest SOC change that is possible in the time by which a busy machine delayed the player."""
+        """Error and stated deviation of the estimates on the bus, from sample `after` on. Each error is reduced by the
+        largest possible SOC change in the delay of the player, which a busy machine causes."""
         sample, found = -1, []
         self.latest_s = 0.0
         late_s = collections.deque(maxlen=MEMORY)  # delay of each sample in the last seconds
@@ -113,7 +113,7 @@ class Truth:
 
 
 def within(errors: list[tuple[float, float]]) -> float:
-    """Share of the errors that are at most two standard deviations plus one point of SOC."""
+    """Fraction of errors that do not exceed two standard deviations plus one point of SOC."""
     return sum(error <= 2 * std + 0.01 for error, std in errors) / max(1, len(errors))
 
 
@@ -129,7 +129,7 @@ def covers(args) -> None:
 
 
 def last_alarm(args) -> None:
-    """State of the last alarm frame of a rule; - without a frame."""
+    """Prints the state in the last alarm frame of a rule, or - if there is no frame."""
     found = [alarm.state for name, data in frames(open(args.dump)) if name == ALARM and (alarm := Alarm(data)).rule == args.rule]
     print(found[-1] if found else "-")
 
@@ -142,11 +142,11 @@ RULES = (
     "connection_resistance channel_faulty thermal_event"
 ).split()
 SEVERITIES = {"info": 1, "warning": 2, "severe": 3}
-NOT_STORED = ("suppressed", "resumed")  # changes without a row in the store
+NOT_STORED = ("suppressed", "resumed")  # changes that get no row in the store
 
 
 class Store:
-    """The rows of a state folder's database, read while the daemon runs or afterwards."""
+    """The rows of a state folder's database. The daemon may still be running."""
 
     def __init__(self, folder: Path):
         database = sqlite3.connect(f"file:{folder / 'packwatch.db'}?mode=ro", uri=True, timeout=10)
@@ -162,7 +162,7 @@ class Store:
         return len(self.capacities), len(self.half_cycles), len(self.alarms)
 
     def begins_with(self, earlier: "Store") -> bool:
-        """Whether all rows of an earlier state still exist unchanged."""
+        """Whether all rows of the earlier state still exist unchanged."""
         pairs = [(self.half_cycles, earlier.half_cycles), (self.capacities, earlier.capacities), (self.alarms, earlier.alarms)]
         return all(now[: len(before)] == before for now, before in pairs)
 
@@ -182,8 +182,7 @@ def reported_by(files: list[Path]) -> tuple[int, int, int]:
 
 
 def learned(args) -> None:
-    """Reads the reports before the store. If the daemon stores and reports a value in between, the store then has an extra row,
-    which is allowed."""
+    """Reads the reports before the store, so that a value stored in between is an extra row, which is allowed."""
     reported, stored = reported_by(args.events), Store(args.state).counts()
     print(" ".join(map(str, stored)))
     if any(of_store < of_events for of_store, of_events in zip(stored, reported)):
@@ -200,7 +199,7 @@ RAISED = ("active", "latched", "suppressed")  # suppressed: the alarm's input is
 
 
 def learned_of(snapshot: dict) -> tuple[list, list]:
-    """Capacities and raised alarms, which must be restored after a restart."""
+    """Capacities and raised alarms. A restart must restore them."""
     capacities = [round(cell["mean"], 9) for cell in snapshot["learning"]["learner"]["capacity"]]
     alarms = [[a["rule"], a["severity"], a["cell"]] for a in snapshot["alarming"]["alarms"]["alarms"]
               if a["machine"]["state"] in RAISED and a["rule"] not in OF_NOW]
@@ -208,7 +207,7 @@ def learned_of(snapshot: dict) -> tuple[list, list]:
 
 
 def comes_back(before: dict, after: dict) -> bool:
-    """Whether a later state contains all learned values. Without input, other alarms may have been raised since."""
+    """Whether the later state contains all learned values. Without input, other alarms may have been raised since."""
     (capacities, alarms), (later_capacities, later_alarms) = learned_of(before), learned_of(after)
     near = all(abs(now - then) < 1e-6 for then, now in zip(capacities, later_capacities, strict=True))
     return near and all(alarm in later_alarms for alarm in alarms)
@@ -267,7 +266,7 @@ class Bus:
 
 
 def park(bus: Bus, rests: list) -> None:
-    """Half a second without current, so that running half-cycles end and are learned."""
+    """Sends half a second without current, so that running half-cycles end and are learned."""
     for _ in range(50 if rests else 0):
         bus.send(0x100, bytes(4) + rests[-1][4:])
         time.sleep(0.01)
@@ -301,7 +300,7 @@ def play(args) -> None:
 
 
 def flood(args) -> None:
-    """Sends a burst of frames every 10 ms, as many as the rate requires."""
+    """Sends a burst of frames every 10 ms. The size of a burst follows from the rate."""
     bus, rng = Bus(args.interface), random.Random(1)
     ids = [0x200 + n for n in range(min(args.ids, 0x480))] + [0x18000000 + 977 * n for n in range(args.ids - 0x480)]
     data = [rng.randbytes(8) for _ in range(64)]
@@ -315,7 +314,7 @@ def flood(args) -> None:
 
 
 def clients(args) -> None:
-    """One process with many idle clients that never read. Clients of another process must still be answered."""
+    """Opens many idle clients that never read, in one process. Clients of another process must still be answered."""
     def connected(path):
         client = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         client.settimeout(10)

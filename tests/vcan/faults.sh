@@ -1,19 +1,18 @@
 # shellcheck shell=bash
 # Helpers for tests of faults:   . "$(dirname "$0")/lib.sh"; . "$(dirname "$0")/daemon.sh"; . "$(dirname "$0")/faults.sh"
-# A daemon with its state on disk learns from fast_pack (a simulated pack in fast motion) while faults occur. Each test prints one
-# line per fault: the fault and the learned values. At the end it compares the store with the reports.
+# A daemon with its state on disk learns from fast_pack (a simulated pack in fast motion) while faults occur. Each test
+# prints one line per fault. At the end, it compares the store with the reports.
 
-# Folder of `main`'s state; a test with its own disk overrides it.
+# Folder of the state of `main`. A test with its own disk overrides this path.
 state=$tmp/state
 here=$(dirname "${BASH_SOURCE[0]}")
 fast=$tmp/fast
 tools() { python3 "$here/fault_tools.py" "$@"; }
 
-# pack SECONDS: writes fast_pack's files to $fast; the daemon uses $fast/fast.toml.
+# pack SECONDS: writes fast_pack's files to $fast.
 pack() { "$here/fast_pack" "$fast" --seconds "$1"; }
 
-# feed: continues to play the pack on vcan0, regardless of the interface's state. dump.log contains the pack's samples and
-# packwatch's frames of all feeds.
+# feed: continues to play the pack on vcan0. dump.log contains the pack's samples and packwatch's frames of all feeds.
 feed() {
     if [[ -z ${pids[dump]-} ]]; then
         start dump candump -L any,6B0:7F0,7F0:7FE
@@ -22,7 +21,6 @@ feed() {
     start feed python3 "$here/fault_tools.py" play "$fast/pack.log" vcan0 --from "$(sample)"
 }
 unfed() { stop feed; }
-# Number of the last sample on the bus.
 sample() {
     local last
     last=$(grep -oE ' 7F0#[0-9A-F]{8}$' "$tmp/dump.log" | tail -n 1) || true
@@ -30,7 +28,7 @@ sample() {
     echo $((16#${last:-0}))
 }
 
-# again WHAT...: starts the daemon `main` again after `stop main` or similar; its earlier reports still count.
+# again WHAT...: starts the daemon `main` again, for example after `stop main`. Its earlier reports still count.
 runs=0
 again() {
     local file
@@ -41,11 +39,10 @@ again() {
 
 # ---- what was learned ----------------------------------------------------------------------------------------------------------------
 
-# reported EVENT: number of such events reported by the daemon `main`, in all its runs.
+# reported EVENT: number of such events that the daemon `main` has reported in all its runs.
 reported() { cat "$tmp"/main*.events | grep -E "\"event\":\"$1\"" | grep -cvE '"measured_ah":null|"change":"(suppressed|resumed)"' || true; }
 # Number of reported capacities, half-cycles, and alarms raised or cleared.
 reported_all() { echo "$(reported capacity) $(reported half_cycle) $(reported alarm)"; }
-# reported_more EVENT COUNT: whether at least COUNT were reported.
 reported_more() { (($(reported "$1") >= $2)); }
 learned_more() { reported_more half_cycle "$1"; }
 
@@ -55,8 +52,8 @@ fault() {
     running main || fail "$fault_name: the daemon is not running before the fault"
 }
 
-# survived WHAT...: marks the end of the fault. The daemon must still be the same process, keep learning, and have stored all
-# its reports.
+# survived WHAT...: marks the end of the fault. The same process must keep learning, and must have stored all its
+# reports.
 survived() {
     local stored after
     running main || fail "$fault_name: the daemon ended"
@@ -66,7 +63,7 @@ survived() {
     echo "$fault_name: $*; learned (capacities, half-cycles, alarms): before $fault_before, after $after, stored $stored"
 }
 
-# all_stored: at the end, with the daemon stopped, the store must contain exactly the reported values and a valid chain.
+# all_stored: call at the end. The store must contain exactly the reported values and a valid chain.
 all_stored() {
     local stored
     stored=$(tools learned "$state" "$tmp"/main*.events --exactly 2>"$tmp/learned.err") || fail "at the end: $(cat "$tmp/learned.err")"

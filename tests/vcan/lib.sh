@@ -1,7 +1,6 @@
 # shellcheck shell=bash
 # Helpers for vcan tests in bash:   . "$(dirname "$0")/lib.sh"
-# A failed assertion, a failed command or a missed deadline ends the test with status 1 and shows the logs of all started
-# programs. These programs are killed at the end. $tmp is the test's own folder.
+# If an assertion or a command fails, the test ends with status 1 and shows the logs of all started programs. $tmp is the test's folder.
 set -euo pipefail
 
 tmp=$(mktemp -d)
@@ -11,7 +10,7 @@ exit_status='' # exit status of the last process that `stop` or `wait_exit` wait
 
 at_exit() {
     local status=$? name
-    # wait: prevents bash from announcing each killed process.
+    # wait: keeps bash from announcing each killed process.
     for name in "${!pids[@]}"; do { kill -KILL "${pids[$name]}" && wait "${pids[$name]}"; } 2>/dev/null || true; done
     if [[ $status != 0 && $status != 77 ]]; then
         for name in "$tmp"/*.log; do
@@ -28,7 +27,7 @@ fail() {
     exit 1
 }
 
-# skip MESSAGE...: this machine lacks something that the test needs. Shown and counted as skipped.
+# skip MESSAGE...: this machine lacks something that the test needs.
 skip() {
     echo "SKIP $*" >&2
     exit 77
@@ -39,14 +38,14 @@ assert_eq() {
     [[ $1 == "$2" ]] || fail "$3:"$'\n'"wanted: $1"$'\n'"found:  $2"
 }
 
-# Milliseconds of a clock that never steps (the test may step the wall clock).
+# Milliseconds of a clock that never steps. (The test may step the wall clock.)
 now_ms() {
     local uptime _
     read -r uptime _ </proc/uptime
     echo $((10#${uptime/./} * 10))
 }
 
-# wait_for SECONDS WHAT COMMAND...: repeats COMMAND until it succeeds. Does not hide COMMAND's output.
+# wait_for SECONDS WHAT COMMAND...: repeats COMMAND until it succeeds.
 wait_for() {
     local deadline=$(($(now_ms) + $1 * 1000)) seconds=$1 what=$2
     shift 2
@@ -56,7 +55,7 @@ wait_for() {
     done
 }
 
-# start NAME COMMAND...: runs in the background with output to $tmp/NAME.log. The process id is ${pids[NAME]}.
+# start NAME COMMAND...: runs COMMAND in the background with output to $tmp/NAME.log.
 start() {
     local name=$1
     shift
@@ -78,13 +77,14 @@ wait_exit() {
     unset "pids[$1]"
 }
 
-# stop NAME [SIGNAL]: sends the signal (TERM) and waits up to 10 s. Sets $exit_status (143 if TERM killed it).
+# stop NAME [SIGNAL]: sends the signal (TERM) and waits up to 10 s. Sets $exit_status.
 stop() {
     kill -"${2-TERM}" "${pids[$1]}" 2>/dev/null || fail "stop $1: it had already ended"
     wait_exit "$1" 10
 }
 
-# Whether NAME's log has a line that matches the (extended) regular expression:   wait_for 5 "start" logged daemon 'ready'
+# Whether NAME's log has a line that matches the (extended) regular expression:   wait_for 5 "start" logged daemon
+# 'ready'
 logged() { grep -qE -- "$2" "$tmp/$1.log"; }
 # caught_up NAME: whether candump NAME on vcan0 has received all earlier frames. Sends a frame that no other node uses.
 caught_up() { cansend vcan0 7FF#0123 && logged "$1" '7FF#0123'; }
@@ -94,9 +94,9 @@ iface_delete() { ip link delete dev "$1"; }
 iface_up() { ip link set dev "$1" up; }
 iface_down() { ip link set dev "$1" down; }
 
-# receiving IFACE COUNT: whether the kernel lists at least COUNT receive filters on IFACE ("any": filters of sockets that are not
-# bound to an interface).
-# A frame sent before its receiver is listed is lost, and candump does not print anything when it is ready:
+# receiving IFACE COUNT: whether the kernel lists at least COUNT receive filters on IFACE ("any": filters of sockets
+# that are not bound to an interface). If a frame is sent before its receiver is listed, it is lost. candump prints
+# nothing when it is ready, so wait:
 #   start dump candump -L vcan0; wait_for 5 "receiver on vcan0" receiving vcan0 1
 receiving() {
     awk -v iface="$1" -v wanted="$2" '$1 == iface && NF == 7 { n++ } END { exit n < wanted }' /proc/net/can/rcvlist_*

@@ -10,10 +10,11 @@ The first lines of a test state its needs:
     # run-tests: 45 s, own boot: sets the clock    needs a separate kernel, with the reason
     # run-tests: 12 s, smoke                       `--smoke` (and `tests/all --quick`) runs only these
 
-Tests with --disk and tests that boot by themselves ("with-vcan: on the host") also have separate kernels. The others share
-boots: each boot takes the next test from a common queue until the queue is empty (in-boot). Every test has its own network,
-processes, mounts and root. If a kernel dies, its current test fails and the next boot continues with the rest. If the host's
-kernel has vcan, each test runs in its own namespaces without a boot.
+Each test with --disk, and each test that boots the kernel itself ("with-vcan: on the host"), also has a separate
+kernel. The other tests share boots: each boot takes the next test from a common queue (in-boot). Every test has its own
+network, processes, mounts and root. If a kernel dies, its current test fails and the next boot continues with the other
+tests. If the host's kernel has vcan, each test runs in its own namespaces without a boot.
+boot.
 
 A test's output is printed in one piece when the test ends. Exit status: 0, or 1 if a test failed.
 """
@@ -33,9 +34,9 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
-# Tests mostly wait: three boots use two cores about half of the time.
+# Tests mostly wait. Three boots at a time use two cores about half of the time.
 JOBS = 3
-# Time limit that with-vcan applies to a test that states no limit, s.
+# Time limit if a test states no limit, s.
 DEFAULT_LIMIT_S = 120
 # Maximum boot time on a busy machine, s.
 BOOT_S = 60
@@ -85,8 +86,8 @@ CHILDREN: set[subprocess.Popen] = set()
 
 
 def environment() -> dict[str, str]:
-    """A copy of the environment for a child. Otherwise the child would read this process's environment, which another thread of
-    tests/all may be replacing; its start then fails with "Bad address"."""
+    """Returns a copy of the environment for a child. Otherwise the child's start may fail with "Bad address" while
+    another thread of tests/all replaces the environment."""
     return dict(os.environ)
 
 
@@ -103,8 +104,7 @@ def read_head(path: Path) -> VcanTest:
 
 
 def in_user_mode_kernel(modules: set[str]) -> bool:
-    """Whether with-vcan boots a kernel on this machine; False if the host's kernel has vcan. Raises if there is no
-    SocketCAN."""
+    """Whether with-vcan boots a kernel on this machine. Raises an error if there is no SocketCAN."""
     probe = [HERE / "with-vcan", "--timeout", str(BOOT_S), "--modules", ",".join(sorted(modules)), "--",
              "grep", "-q", "User Mode Linux", "/proc/cpuinfo"]
     ended = subprocess.run(probe, env=environment(), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
@@ -115,7 +115,7 @@ def in_user_mode_kernel(modules: set[str]) -> bool:
 
 
 class Run:
-    """All tests of one call, shared by all job threads."""
+    """All tests of one call. All job threads share it."""
 
     def __init__(self, tests: Iterable[VcanTest], queue: Path, report: Report, uses_user_mode_kernel: bool):
         tests = sorted(tests, key=lambda test: -test.expected_s)
@@ -147,7 +147,7 @@ class Run:
         return [test for name, test in self.shared.items() if not (self.queue / name).exists()]
 
     def run_shared(self) -> None:
-        """Boots until every test is claimed: once, unless a kernel dies."""
+        """Boots until every test is claimed. One boot is enough unless a kernel dies."""
         while rest := self.unclaimed():
             with self.lock:
                 self.boots += 1
@@ -207,7 +207,7 @@ def call(command: list, while_waiting: Callable[[], None] = lambda: None) -> tup
 
 
 def stop_all() -> None:
-    """Ends every kernel: with-vcan passes the signal on and cleans up."""
+    """Ends every kernel. with-vcan passes the signal on and cleans up."""
     for child in list(CHILDREN):
         child.send_signal(signal.SIGTERM)
     for child in list(CHILDREN):
@@ -215,7 +215,7 @@ def stop_all() -> None:
 
 
 def run(tests: list[VcanTest], report: Report, jobs: int = JOBS) -> None:
-    """Runs `tests`. Calls `report` from several threads as each test ends."""
+    """Runs `tests`. When a test ends, calls `report` from the test's thread."""
     modules = set().union(*(test.modules for test in tests)) if tests else set()
     with tempfile.TemporaryDirectory(prefix="vcan-tests.") as folder:
         queue = Path(folder).resolve()

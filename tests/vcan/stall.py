@@ -1,8 +1,7 @@
 #!/usr/bin/env python3
 """Stops one thread of a process, as if it hung: tests/vcan/stall.py PID. The other threads keep running.
 
-Traces the process's first thread (which runs the loop) and keeps it stopped until this program is killed or the process is
-gone. SIGSTOP would instead stop all threads."""
+Traces the process's first thread (which runs the loop). SIGSTOP would instead stop all threads."""
 
 import ctypes
 import os

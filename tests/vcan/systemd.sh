@@ -1,6 +1,6 @@
 # shellcheck shell=bash
-# A real systemd as process 1, for tests of the shipped units:   . "$(dirname "$0")/lib.sh"; . "$(dirname "$0")/systemd.sh"
-# It runs in its own process and mount namespaces, with journald, and with udev on request. Use in a test:
+# Runs a real systemd as process 1, for tests of the shipped units:   . "$(dirname "$0")/lib.sh"; . "$(dirname "$0")/systemd.sh"
+# It has its own process and mount namespaces, with journald, and with udev on request. Use in a test:
 #
 #   systemd_prepare paper.toml            # program, units and configuration where the package puts them
 #   drop_in packwatch.service test '[Service]' 'WatchdogSec=3s'
@@ -31,11 +31,10 @@ systemd_prepare() {
     done
 }
 
-# drop_in UNIT NAME LINE...: adds a drop-in. After the boot it also runs `systemctl daemon-reload`.
 drop_in() {
     local folder=$units/$1.d name=$2
     shift 2
-    # After the boot the folder has another path inside the namespace.
+    # Inside the namespace, the folder has another path.
     if [[ -n ${pids[systemd]-} ]]; then
         in_system mkdir -p "/run/systemd/system/${folder##*/}"
         printf '%s\n' "$@" | in_system tee "/run/systemd/system/${folder##*/}/$name.conf" >/dev/null
@@ -46,7 +45,7 @@ drop_in() {
     fi
 }
 
-# with_udev: call before the boot. Network devices then become units, as on a real system.
+# with_udev: call this before the boot. Network devices then become units, as on a real system.
 with_udev() {
     [[ -x /usr/lib/systemd/systemd-udevd ]] || skip "no udev on this machine"
     printf '%s\n' '[Unit]' DefaultDependencies=no Before=test.target '[Service]' Type=notify \
@@ -55,7 +54,6 @@ with_udev() {
     printf 'Wants=test-udev.service\nAfter=test-udev.service\n' >>"$units/test.wants"
 }
 
-# systemd_boot [UNIT...]: boots a system that contains only those units and the journal.
 systemd_boot() {
     local wanted="${*-packwatch.service}" deadline
     {
@@ -64,16 +62,15 @@ systemd_boot() {
     } >"$units/test.target"
     printf '[Journal]\nStorage=volatile\nRuntimeMaxUse=32M\nForwardToConsole=no\nRateLimitIntervalSec=0\n' >/etc/systemd/journald.conf
     start systemd unshare --mount --pid --fork --kill-child --mount-proc bash -c "$(declare -f systemd_init); systemd_init '$units'"
-    # bash becomes systemd there: the process exists at once, the manager's socket later.
+    # bash becomes systemd in this process. The manager's socket appears later.
     wait_for 20 "systemd" booted
 }
 
 booted() { [[ -n $(system_process) ]] && in_system test -S /run/systemd/private; }
 system_process() { pgrep -P "${pids[systemd]}" || true; }
 
-# Process 1 of the namespaces.
 systemd_init() {
-    # Mount a new /sys, because the old one belongs to the kernel's first network namespace and does not show these interfaces.
+    # The old /sys belongs to the kernel's first network namespace and does not show these interfaces.
     mount -t sysfs sysfs /sys && mount -t tmpfs tmpfs /run && mount -t cgroup2 cgroup2 /sys/fs/cgroup
     mkdir -p /run/systemd && cp -r "$1" /run/systemd/system && rm -f /run/systemd/system/test.wants
     exec env -i container=test PATH="$PATH" /usr/lib/systemd/systemd --system --unit=test.target \
@@ -85,13 +82,10 @@ in_system() { nsenter --target "$(system_process)" --mount --pid "$@"; }
 property() { in_system systemctl show "${2-packwatch.service}" --property "$1" --value 2>/dev/null; }
 # has NAME VALUE [UNIT]
 has() { [[ $(property "$1" "${3-packwatch.service}") == "$2" ]]; }
-# status_has REGEX: matches the status line that the daemon sent to systemd.
 status_has() { [[ $(property StatusText) =~ $1 ]]; }
-# journal [ARGS...]: packwatch's journal entries, message only.
 journal() { in_system journalctl --quiet --no-pager --unit packwatch.service --output cat "$@"; }
-# Not grep -q: it ends at the first match, and journalctl would then fail the pipeline with SIGPIPE.
+# Do not use grep -q. It ends at the first match, and journalctl would then fail the pipeline with SIGPIPE.
 journal_has() { journal | grep -E -- "$1" >/dev/null; }
 
-# Shown if a test fails (lib.sh shows $tmp/*.log).
 keep_journal() { [[ -z ${pids[systemd]-} ]] || journal >"$tmp/journal.log" 2>&1 || true; }
 trap 'status=$?; set +e; keep_journal; (exit $status); at_exit' EXIT

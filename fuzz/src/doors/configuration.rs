@@ -1,5 +1,5 @@
-//! Fuzz entry points for configurations and cell models. If a configuration is accepted, a monitor must run with it and
-//! accept its own stored state.
+//! Fuzz entry points for configurations and cell models. With an accepted configuration, a monitor must run and accept
+//! its own stored state.
 
 use packwatch::config::Config;
 use packwatch::monitor::{Downtime, Monitor, Outputs, Snapshot};
@@ -10,7 +10,7 @@ use super::world::{self, CELL, DBC, PACK};
 
 const REFERENCE: &str = include_str!("../../../docs/src/reference/keys.md");
 
-/// All configuration keys with a numeric value, as pairs of table and key, read from the reference page.
+/// Returns all configuration keys with a numeric value, as pairs of table and key, from the reference page.
 fn keys() -> &'static [(&'static str, &'static str)] {
     static KEYS: std::sync::OnceLock<Vec<(&str, &str)>> = std::sync::OnceLock::new();
     KEYS.get_or_init(|| {
@@ -29,7 +29,7 @@ fn keys() -> &'static [(&'static str, &'static str)] {
     })
 }
 
-/// The base configuration with numbers of any size in one to six keys.
+/// Returns the base configuration with numbers of any size in one to six keys.
 fn drawn(source: &mut Source<'_>) -> Vec<u8> {
     let mut text = PACK.to_owned();
     for _ in 0..=source.byte() % 6 {
@@ -51,7 +51,7 @@ fn drawn(source: &mut Source<'_>) -> Vec<u8> {
     text.into_bytes()
 }
 
-/// Loads arbitrary bytes, or a configuration with numbers of any size. Runs a monitor if the configuration is accepted.
+/// Loads arbitrary bytes, or a configuration with numbers of any size. If it is accepted, runs a monitor.
 pub fn configuration(data: &[u8]) {
     let mut source = Source::new(data);
     let pack = if source.byte().is_multiple_of(4) { source.rest().to_vec() } else { drawn(&mut source) };
@@ -60,8 +60,8 @@ pub fn configuration(data: &[u8]) {
     }
 }
 
-/// Loads arbitrary bytes as the cell model, or the example cell model with one to six changed numbers. Runs a monitor
-/// if the model is accepted.
+/// Loads arbitrary bytes as the cell model, or the example cell model with one to six changed numbers. If it is
+/// accepted, runs a monitor.
 pub fn cell_model(data: &[u8]) {
     let mut source = Source::new(data);
     let model = if source.byte().is_multiple_of(4) { source.rest().to_vec() } else { changed(&mut source) };
@@ -87,7 +87,6 @@ fn changed(source: &mut Source<'_>) -> Vec<u8> {
     text.into_bytes()
 }
 
-/// Runs a short drive, then restores a new monitor from the resulting state.
 fn run_and_restore(config: &Config) {
     const DRIVE: &[u8] = &[7, 0xE8, 3, 0, 20, 6, 20, 7, 0x18, 0xFC, 6, 20];
     let mut monitor = Monitor::new(config.monitor.clone());

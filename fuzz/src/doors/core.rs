@@ -1,6 +1,6 @@
 //! Fuzz entry points of the core. The bytes encode up to 3000 inputs of a small simulated vehicle, with its driver,
-//! faults, diagnostic testers and attackers. At a cut, a monitor is replaced by a new one that is restored from the
-//! snapshot of the old one.
+//! faults, diagnostic testers and attackers. At a cut, a new monitor, restored from a snapshot, replaces the old
+//! monitor.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -16,28 +16,28 @@ use packwatch::quantity::{BusIndex, CellIndex, Channel, SensorIndex, Timestamp};
 use super::source::Source;
 use super::world;
 
-/// Maximum number of inputs per execution: about 50 ms of work.
+/// Maximum number of inputs per execution. These inputs take about 50 ms.
 const MAX_INPUTS: usize = 3000;
 /// Maximum number of cuts per execution. Each cut takes as long as some hundred inputs.
 const MAX_CUTS: usize = 100;
-/// Maximum number of outputs per input. The configuration has three cells and 14 alarm rules.
+/// Maximum number of outputs per input, for three cells and 14 alarm rules.
 const MAX_OUTPUTS: usize = 2000;
-/// Numbers of inputs and cuts in all executions of this process, printed for tests/fuzz.
+/// Numbers of inputs and cuts in all executions of this process. They are printed for `tests/fuzz`.
 static INPUTS: AtomicU64 = AtomicU64::new(0);
 static CUTS: AtomicU64 = AtomicU64::new(0);
-/// Number of inputs after which the counts are printed again.
+/// Number of inputs between two prints of these counts.
 const REPORT_EVERY: u64 = 100_000;
 const BUS: BusIndex = BusIndex(0);
 /// CAN identifiers that the monitor uses with this configuration: output messages and diagnostic requests.
 const OWN: [u16; 8] = [0x6B0, 0x6B1, 0x6B2, 0x6B4, 0x6B5, 0x6B6, 0x79B, 0x7DF];
-/// Address of the J1939 node, and the source address that the node uses until it has claimed an address.
+/// Address of the J1939 node, and its source address until it has claimed an address.
 const OWN_ADDRESSES: [u32; 2] = [249, 254];
 const MS: i64 = 1_000_000;
-/// If no input arrives for longer than this time in seconds, a restored monitor assumes that the program was off.
+/// If no input arrives for longer than this (s), a restored monitor assumes that the program was off.
 const BREAK_S: f64 = 30.0;
 
-/// Feeds the inputs to a monitor and checks its outputs. In one of eight executions, a second run with the same inputs
-/// must give the same outputs.
+/// Feeds the inputs to a monitor and checks its outputs. In one of eight executions, a second run must give the same
+/// outputs.
 pub fn core(data: &[u8]) {
     let mut source = Source::new(data);
     let is_repeated = source.byte().is_multiple_of(8);
@@ -48,7 +48,7 @@ pub fn core(data: &[u8]) {
     }
 }
 
-/// Feeds the same inputs to two monitors. One of the monitors is cut regularly. Both must give the same outputs.
+/// Feeds the same inputs to two monitors, one of which is cut regularly. Both must give the same outputs.
 pub fn cuts(data: &[u8]) {
     let mut source = Source::new(data);
     let steps = [1 + usize::from(source.byte()), 1 + usize::from(source.byte())];
@@ -57,8 +57,8 @@ pub fn cuts(data: &[u8]) {
     let (mut expected, mut found) = (outputs(), outputs());
     let (mut until_cut, mut cuts) = (steps[0], 0);
     for (nth, record) in records.iter().enumerate() {
-        // Measure the break from the monitor's clock, not from the previous stamp: if earlier stamps follow a stamp in
-        // the far future, the monitor does not immediately set its clock back.
+        // The break is measured from the monitor's clock, not from the previous stamp. These differ, because the
+        // monitor does not immediately set its clock back if earlier stamps follow a stamp in the far future.
         let is_break = record.time.since(whole.now()).abs() > BREAK_S;
         if until_cut == 0 && cuts < MAX_CUTS && !is_break {
             cuts += 1;
@@ -76,7 +76,7 @@ pub fn cuts(data: &[u8]) {
     count(records.len(), cuts);
 }
 
-/// Feeds the inputs to a monitor, checks the outputs if `is_checked`, and returns a hash of the outputs.
+/// Feeds the inputs to a monitor, and checks the outputs if `is_checked` is set. Returns a hash of the outputs.
 fn run(records: &[Record], is_checked: bool) -> u64 {
     let (mut monitor, mut out, mut digest) = (monitor(), outputs(), 0xCBF2_9CE4_8422_2325);
     let mut digested = |number: u64| digest = (digest ^ number).wrapping_mul(0x0100_0000_01B3);
@@ -106,7 +106,6 @@ fn handle(monitor: &mut Monitor, record: &Record, out: &mut Outputs) {
     monitor.handle(record, out);
 }
 
-/// Adds to this process's counts and prints them from time to time.
 fn count(inputs: usize, cuts: usize) {
     let (inputs, cuts) = (inputs as u64, cuts as u64);
     let before = INPUTS.fetch_add(inputs, Ordering::Relaxed);
@@ -116,7 +115,6 @@ fn count(inputs: usize, cuts: usize) {
     }
 }
 
-/// Restores a monitor from another monitor's state in its stored form.
 fn restored(monitor: &Monitor) -> Monitor {
     let text = serde_json::to_string(&monitor.snapshot()).expect("a snapshot serialises to JSON");
     let snapshot: Snapshot = serde_json::from_str(&text).expect("its own snapshot reads back");
@@ -125,11 +123,10 @@ fn restored(monitor: &Monitor) -> Monitor {
     restored
 }
 
-/// Whether frames, events and estimates are bit-identical.
 fn is_same(one: &Outputs, other: &Outputs) -> bool {
     let are_events_same = || match (one.events.is_empty(), other.events.is_empty()) {
         (true, true) => true,
-        // Compare as text: NaN then equals NaN, and zero differs from minus zero.
+        // In text, NaN equals NaN, and zero differs from minus zero.
         _ => format!("{:?}", one.events) == format!("{:?}", other.events),
     };
     one.frames == other.frames
@@ -137,7 +134,6 @@ fn is_same(one: &Outputs, other: &Outputs) -> bool {
         && are_events_same()
 }
 
-/// Every field of an estimate, as bits.
 fn numbers(estimate: &Estimate) -> impl Iterator<Item = u64> + use<> {
     let Estimate { time, cell, soc, soc_std, branch_v, capacity_ah, capacity_std_ah, .. } = *estimate;
     let Estimate { resistance_ratio, resistance_ratio_std, innovation_v, innovation_std_v, accepted, measured, .. } =
@@ -188,7 +184,6 @@ pub(super) fn check(record: &Record, out: &Outputs) {
     }
 }
 
-/// State of the simulated vehicle.
 struct Vehicle {
     encoder: InputEncoder,
     now_ns: i64,
@@ -203,7 +198,6 @@ struct Vehicle {
     records: Vec<Record>,
 }
 
-/// Returns the inputs that the bytes encode.
 pub(super) fn records(source: &mut Source<'_>) -> Vec<Record> {
     let mut vehicle = Vehicle {
         encoder: InputEncoder::new(&world::config().monitor.input),
@@ -322,7 +316,7 @@ impl Vehicle {
         }
     }
 
-    /// Adds the frames of a healthy pack in one period, and the tick at the end of the period.
+    /// Adds the frames of a healthy pack in one period, and the tick at its end.
     fn drive(&mut self, period_ns: i64) {
         self.soc = (self.soc - self.current_a * period_ns as f64 / 1e9 / 3600.0 / 2.6 * 10.0).clamp(0.02, 0.98);
         let voltage_v = 3.3 + 0.8 * self.soc - 0.03 * self.current_a + self.offset_v;

@@ -1,5 +1,5 @@
-//! Fuzz entry points for files that are read in blocks: logs, journals, tables. The test files are written to a
-//! folder in memory if possible.
+//! Fuzz entry points for files that are read in blocks: logs, journals, tables. If possible, the test files are written
+//! to a folder in memory.
 
 use std::path::Path;
 
@@ -9,7 +9,6 @@ use packwatch::monitor::Record;
 
 use super::source::Source;
 
-/// Maximum number of records compared.
 const MAX_RECORDS: usize = 20_000;
 
 /// Calls `read` with a file of this name and content.
@@ -20,21 +19,21 @@ pub(super) fn with_file<T>(name: &str, content: &[u8], read: impl FnOnce(&Path) 
     read(&path)
 }
 
-/// A folder that is deleted on drop.
+/// Creates a folder that is deleted on drop.
 pub(super) fn folder() -> tempfile::TempDir {
     let memory = Path::new("/dev/shm");
     let made = if memory.is_dir() { tempfile::tempdir_in(memory) } else { tempfile::tempdir() };
     made.expect("a folder")
 }
 
-/// A candump log or CSV, plain or compressed: the first byte selects the file name.
+/// Reads a candump log or CSV, plain or compressed. The first byte selects the file name.
 pub fn log(data: &[u8]) {
     let mut source = Source::new(data);
     let name = source.one_of(&["a.log", "a.csv", "a.log.gz", "a.log.zst", "a.csv.zst"]);
     with_file(name, source.rest(), compare);
 }
 
-/// A journal.
+/// Reads a journal.
 pub fn journal(data: &[u8]) {
     let content = [b"PACKWATCH-JOURNAL 1\n", data].concat();
     with_file("a.journal", &content, compare);
@@ -52,8 +51,8 @@ fn options(strict: bool) -> LogOptions {
     }
 }
 
-/// Reading records one by one and in batches must give the same records. In strict mode, reading must give a prefix of
-/// these records.
+/// Checks that reading records one by one and in batches gives the same records. In strict mode, reading must give a
+/// prefix of these records.
 fn compare(path: &Path) {
     let one_by_one = |strict: bool| -> (Vec<Record>, bool) {
         let mut log = LogSource::new([path.to_owned()], options(strict));
@@ -75,7 +74,7 @@ fn compare(path: &Path) {
     while batched.len() < records.len() && log.next_batch(&mut batch).unwrap_or(false) {
         batched.extend_from_slice(batch.records());
     }
-    // Compare as text, because NaN does not equal NaN.
+    // Text is compared because NaN does not equal NaN.
     let text = |records: &[Record]| format!("{records:?}");
     let count = records.len().min(batched.len());
     assert_eq!(records.len(), count, "batches end before the records");
@@ -84,7 +83,7 @@ fn compare(path: &Path) {
     assert!(text(&strict) == text(&records[..strict.len().min(count)]), "a strict reader gives other records");
 }
 
-/// A table of measured values, as the offline commands read it.
+/// Reads a table of measured values as the offline commands do.
 #[cfg(feature = "lab")]
 pub fn table(data: &[u8]) {
     use packwatch::lab::gpr::{ColumnSelection, ColumnTable, MissingPolicy, PartColumn};

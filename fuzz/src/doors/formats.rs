@@ -8,7 +8,6 @@ use packwatch_formats::{Format, Item, Source as LogSource};
 use super::files::with_file;
 use super::source::Source;
 
-/// Maximum number of items compared.
 const MAX_ITEMS: usize = 20_000;
 
 /// Returns at most seven bytes per call.
@@ -21,8 +20,9 @@ impl<R: Read> Read for Trickle<R> {
     }
 }
 
-/// A log of another tool: the first byte selects the format. Reading it in small parts must give the same items. The
-/// channel of each item must be in the list of channels, and a reader that has ended must stay at its end.
+/// Reads a log of another tool; the first byte selects the format. Reading in small parts must give the same items. The
+/// channel of each item must be in the list of channels. After the end of the log, the reader must give no further
+/// items.
 pub fn formats(data: &[u8]) {
     let mut source = Source::new(data);
     let format = source.one_of(Format::ALL);

@@ -1,13 +1,13 @@
-//! Fuzz entry points ("doors"): each takes arbitrary bytes, feeds them to one input of the program and panics if an
+//! Fuzz entry points ("doors"). Each takes arbitrary bytes, feeds them to one input of the program, and panics if an
 //! invariant is broken.
 //!
 //! | entry point | input of the program | invariants, in addition to "no panic" |
 //! | --- | --- | --- |
-//! | `core` | frames, ticks, gaps, commands, J1939, diagnostics into the monitor | only own identifiers are sent; estimates are finite; an unknown value clears no alarm; a second run gives the same outputs |
+//! | `core` | inputs of the monitor: frames, ticks, gaps, commands, J1939, diagnostics | only own identifiers are sent; estimates are finite; an unknown value clears no alarm; a second run gives the same outputs |
 //! | `cuts` | as for `core`, with snapshots taken and restored in between | the monitor accepts its own state; frames, events and estimates are bit-identical to a run without snapshots |
-//! | `snapshot` | a stored state with damaged numbers | either rejected, or the monitor runs on with finite outputs and accepts the state that it then writes |
+//! | `snapshot` | a stored state with damaged numbers | the state is rejected, or the monitor runs on with finite outputs and accepts the state that it then writes |
 //! | `configuration` | TOML with numbers of any size in any key | with an accepted configuration, a monitor runs and accepts its own state |
-//! | `cell_model` | a cell model file | as for `configuration` |
+//! | `cell_model` | a cell model file | with an accepted model, a monitor runs and accepts its own state |
 //! | `dbc` | a DBC file | a written DBC reads back unchanged |
 //! | `log`, `journal` | candump logs, CSV, journals | reading records one by one and in batches gives the same records |
 //! | `formats` | logs of other tools | reading in small parts gives the same items; nothing follows the end |
@@ -29,7 +29,7 @@ mod world;
 /// An entry point: takes arbitrary bytes and panics if an invariant is broken.
 pub type Door = fn(&[u8]);
 
-/// All entry points by name. The fuzz target and the seed folder of an entry point also have this name.
+/// All entry points by name. The fuzz target and the seed folder of an entry point have the same name.
 pub const DOORS: &[(&str, Door)] = &[
     ("core", core::core),
     ("cuts", core::cuts),
@@ -50,10 +50,10 @@ pub const DOORS: &[(&str, Door)] = &[
     ("bpx", texts::bpx),
 ];
 
-/// The entry point with the given name.
+/// Returns the entry point with this name.
 ///
 /// # Panics
-/// If no entry point has that name.
+/// There is no entry point with this name.
 pub fn door(name: &str) -> Door {
     DOORS
         .iter()

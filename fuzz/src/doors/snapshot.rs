@@ -1,5 +1,5 @@
-//! Fuzz entry point for a stored state with some numbers replaced, or for arbitrary bytes. Either the state is
-//! rejected, or the monitor must start from this state, run, and accept the state that it then writes.
+//! Fuzz entry point for a stored state with some numbers replaced, or for arbitrary bytes. If the state is not
+//! rejected, the monitor must start from it, run, and accept the state that it then writes.
 
 use std::sync::OnceLock;
 
@@ -14,7 +14,6 @@ const DRIVE: &[u8] = &[
     7, 0xE8, 3, 6, 31, 6, 31, 15, 0, 7, 0x18, 0xFC, 6, 31, 6, 31, 8, 120, 0, 31, 23, 5, 14, 1, 0, 0, 0, 0, 0, 3, 0, 31,
 ];
 
-/// The stored state after [`DRIVE`].
 fn stored() -> &'static str {
     static STORED: OnceLock<String> = OnceLock::new();
     STORED.get_or_init(|| {
@@ -25,7 +24,6 @@ fn stored() -> &'static str {
     })
 }
 
-/// Start and end of each number in a JSON text.
 fn numbers(text: &str) -> Vec<(usize, usize)> {
     let (mut found, mut begin, mut is_text) = (Vec::new(), None, false);
     for (at, byte) in text.bytes().enumerate() {
@@ -42,7 +40,6 @@ fn numbers(text: &str) -> Vec<(usize, usize)> {
     found
 }
 
-/// The state with some numbers replaced, or arbitrary bytes.
 fn changed(source: &mut Source<'_>) -> Vec<u8> {
     if source.byte().is_multiple_of(16) {
         return source.rest().to_vec();
@@ -59,7 +56,7 @@ fn changed(source: &mut Source<'_>) -> Vec<u8> {
     text.into_bytes()
 }
 
-/// See the module documentation.
+/// Tests a stored state (see the module documentation).
 pub fn snapshot(data: &[u8]) {
     let mut source = Source::new(data);
     let downtimes = [Downtime::AsStamped, Downtime::Unknown, Downtime::Seconds(0.0), Downtime::Seconds(1e9)];

@@ -1,7 +1,5 @@
-//! Splits bytes into numbers and choices. After the last byte, every further byte reads as zero, so an input of any
-//! length is valid.
+//! Splits bytes into numbers and choices. Bytes after the end read as zero, so an input of any length is valid.
 
-/// The remaining bytes.
 pub(super) struct Source<'a> {
     bytes: &'a [u8],
 }
@@ -15,7 +13,6 @@ impl<'a> Source<'a> {
         self.bytes.is_empty()
     }
 
-    /// Takes all remaining bytes.
     pub(super) fn rest(&mut self) -> &'a [u8] {
         std::mem::take(&mut self.bytes)
     }
@@ -41,7 +38,6 @@ impl<'a> Source<'a> {
         i16::from_le_bytes(self.array())
     }
 
-    /// Returns one of the choices.
     pub(super) fn one_of<T: Copy>(&mut self, choices: &[T]) -> T {
         choices[usize::from(self.byte()) % choices.len()]
     }

@@ -18,15 +18,13 @@ use super::world;
 /// Fuzz input for a drive with a half-cycle.
 const DRIVE: &[u8] = &[7, 0xE8, 3, 6, 31, 6, 31, 7, 0x18, 0xFC, 6, 31, 6, 31, 7, 0xE8, 3, 6, 31];
 
-/// The files of a store.
 const FILES: [&str; 3] = ["packwatch.db", "state-a.json.zst", "state-b.json.zst"];
 
-/// The files of a daemon that has learned values.
 fn stored() -> &'static [Vec<u8>; 3] {
     static STORED: OnceLock<[Vec<u8>; 3]> = OnceLock::new();
     STORED.get_or_init(|| {
         let folder = folder();
-        // Write twice, to fill both state files.
+        // Writing twice fills both state files.
         (0..2).for_each(|_| write(folder.path()));
         FILES.map(|name| std::fs::read(folder.path().join(name)).expect("a file"))
     })
@@ -52,7 +50,7 @@ fn write(path: &Path) {
     store.finish(&monitor, now);
 }
 
-/// See the module documentation.
+/// Damages a file of a store (see the module documentation).
 pub fn store(data: &[u8]) {
     let mut source = Source::new(data);
     let mut files = stored().clone();

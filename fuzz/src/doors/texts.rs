@@ -1,10 +1,10 @@
-//! Fuzz entry points for texts that are parsed as a whole: DBC, requests of the control socket, signal sets and BPX
-//! files.
+//! Fuzz entry points for texts that are parsed as a whole: DBC, requests of the control socket, OBDb signal sets and
+//! BPX files.
 
 use packwatch::can::dbc::Database;
 use packwatch::control::protocol::{AlarmList, CommandOutcome, Request, contents};
 
-/// A DBC file.
+/// Parses a DBC file. A written DBC must read back unchanged.
 pub fn dbc(data: &[u8]) {
     let Ok(database) = Database::parse_bytes(data) else { return };
     let written = database.to_dbc();
@@ -13,7 +13,7 @@ pub fn dbc(data: &[u8]) {
     assert_eq!(again.to_dbc(), written, "the written DBC reads back differently");
 }
 
-/// Parses the bytes as a line sent by a client and as a line sent by a daemon.
+/// Parses the bytes as a line from a client and as a line from a daemon.
 pub fn control(data: &[u8]) {
     if let Ok(request) = Request::parse(data) {
         let line = request.to_line();
@@ -27,7 +27,7 @@ pub fn control(data: &[u8]) {
     }
 }
 
-/// A signal set of OBDb.
+/// Converts a signal set of OBDb.
 #[cfg(feature = "lab")]
 pub fn obdb(data: &[u8]) {
     use packwatch::lab::import::obdb::{ObdbSettings, import};
@@ -35,7 +35,7 @@ pub fn obdb(data: &[u8]) {
     let _ = import(text, &ObdbSettings { source: "fuzz.json".to_owned(), ..ObdbSettings::default() });
 }
 
-/// A BPX file: the converted model must be accepted.
+/// Converts a BPX file. The converted model must be accepted.
 #[cfg(feature = "lab")]
 pub fn bpx(data: &[u8]) {
     use packwatch::lab::import::bpx::{BpxSettings, import};

@@ -1,5 +1,5 @@
-//! The configuration shared by the core's entry points: three cells, protected inputs, all kinds of alarms, commands, a
-//! J1939 node and diagnostic requests.
+//! Defines the configuration that the core's entry points share: three cells, protected inputs, all kinds of alarms,
+//! commands, a J1939 node and diagnostic requests.
 
 use std::io::{Error, ErrorKind};
 use std::path::Path;
@@ -7,7 +7,6 @@ use std::sync::OnceLock;
 
 use packwatch::config::{self, Config, ConfigFaults, ConfigFiles};
 
-/// The cell model that the configuration names.
 pub(super) const CELL: &str = include_str!("../../../config/cells/example_nmc_2600.toml");
 
 pub(super) const DBC: &str = r#"VERSION ""
@@ -144,7 +143,6 @@ rule = "recharge_period_low"
 info = 1000
 "#;
 
-/// Loads a configuration from texts.
 pub(super) fn load(pack: &[u8], dbc: &str, cell: &[u8]) -> Result<Config, ConfigFaults> {
     let read = |path: &Path| match path.to_str() {
         Some("pack.toml") => Ok(pack.to_vec()),
@@ -155,7 +153,6 @@ pub(super) fn load(pack: &[u8], dbc: &str, cell: &[u8]) -> Result<Config, Config
     config::load_with(&ConfigFiles::alone(Path::new("pack.toml")), &read)
 }
 
-/// The shared configuration.
 pub(super) fn config() -> &'static Config {
     static CONFIG: OnceLock<Config> = OnceLock::new();
     let faults = |faults: ConfigFaults| panic!("{}", faults.0.join("\n"));

@@ -9,7 +9,6 @@ const MANY: usize = 4;
 /// Length, in characters, at which a list of cells is cut.
 const MAX_LIST: usize = 24;
 
-/// One row of the alarm table.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct AlarmGroup {
     /// The alarm. In a row for several cells, the alarm with the worst value.

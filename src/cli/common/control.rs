@@ -55,7 +55,7 @@ impl SelectorArgs {
     }
 }
 
-/// Tells the running daemon that another pack is connected.
+/// Reports to the running daemon that another pack is connected.
 pub(crate) fn replace_pack(yes: bool, client: &ControlClient) -> Result<(), Failure> {
     if !yes {
         return Err(Failure::new(

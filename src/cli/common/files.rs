@@ -20,7 +20,6 @@ pub(crate) fn database(file: &Path) -> Result<Database, Failure> {
     Ok(database)
 }
 
-/// Reads a text file.
 pub(crate) fn read(file: &Path) -> Result<String, Failure> {
     bounded_file::read_text(file).map_err(|error| unreadable(file, &error))
 }

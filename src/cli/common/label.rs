@@ -50,7 +50,6 @@ impl LabelArgs {
     }
 }
 
-/// Accepts the names of chemistries.
 pub(crate) fn one_of_chemistries() -> clap::builder::PossibleValuesParser {
     Chemistry::ALL.map(|(_, name)| name).into()
 }

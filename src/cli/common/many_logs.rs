@@ -28,7 +28,6 @@ pub(crate) struct LogArgs {
 }
 
 impl LogArgs {
-    /// Checks arguments that depend on each other.
     pub(crate) fn check(&self) -> Result<(), Failure> {
         check_distinct(&self.logs)?;
         if self.input.start_times.is_some() && self.logs.len() > 1 {

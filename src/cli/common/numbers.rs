@@ -20,7 +20,6 @@ pub(crate) fn one_of<T: Copy + Send + Sync + 'static>(
     PossibleValuesParser::new(names).try_map(find)
 }
 
-/// Parses a finite number.
 pub(crate) fn finite(text: &str) -> Result<f64, String> {
     within(text, |_| true, "a finite number")
 }

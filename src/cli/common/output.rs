@@ -51,14 +51,12 @@ pub(crate) fn print_painted(text: &str) -> Result<(), Failure> {
     unless_closed(written).map_err(|failure| Failure::new(format!("standard output: {}", failure.message)))
 }
 
-/// Writes one JSON document to standard output.
 pub(crate) fn print_json(document: &impl Serialize) -> io::Result<()> {
     let mut out = io::stdout().lock();
     serde_json::to_writer_pretty(&mut out, document)?;
     writeln!(out)
 }
 
-/// Writes a [`table`].
 pub(crate) fn write_table<H: AsRef<str>>(
     out: &mut impl Write,
     heads: &[H],
@@ -68,7 +66,6 @@ pub(crate) fn write_table<H: AsRef<str>>(
     out.write_all(table(heads, rows, left).as_bytes())
 }
 
-/// Creates a folder for results.
 pub(crate) fn create_folder(folder: &Path) -> Result<(), Failure> {
     let created = std::fs::create_dir_all(folder);
     created.map_err(|error| named(folder, format!("cannot be created: {error}")))

@@ -7,7 +7,6 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 use crate::replay::ReplayProgress;
 
-/// Progress on standard error, if that is a terminal.
 #[derive(Debug)]
 pub(crate) struct Bar(ProgressBar);
 
@@ -17,7 +16,6 @@ impl Bar {
         Self(bar(logs))
     }
 
-    /// Shows the current state.
     pub(crate) fn show(&self, progress: ReplayProgress) {
         let seconds = self.0.elapsed().max(Duration::from_millis(1)).as_secs_f64();
         if self.0.is_hidden() {
@@ -33,7 +31,6 @@ impl Bar {
         self.0.elapsed().max(Duration::from_millis(1)).as_secs_f64()
     }
 
-    /// Removes the bar.
     pub(crate) fn clear(&self) {
         self.0.finish_and_clear();
     }

@@ -11,10 +11,9 @@ use crate::io::candump::{StampDigits, write_line, write_stamp};
 use crate::io::result_file::ResultFile;
 use crate::quantity::Timestamp;
 
-/// Mark of an error frame in the identifier.
+/// Flag in the identifier that marks an error frame.
 const ERROR_FRAME: u32 = 1 << 29;
 
-/// A candump log being written.
 pub(super) enum CandumpFile {
     Plain(ResultFile),
     Gzip(GzEncoder<ResultFile>),

@@ -14,7 +14,7 @@ use crate::config::Config;
 use crate::monitor::Outputs;
 use crate::replay::Sinks;
 
-/// The output that the replay writes to, and the first fault.
+/// The output that the replay writes to, and the first error.
 struct Target {
     output: Output,
     fault: Option<io::Error>,
@@ -31,7 +31,6 @@ impl Target {
     }
 }
 
-/// Replays the logs and writes all estimates.
 pub(super) fn write(args: &Args, config: Config, output: Output) -> Result<Output, Failure> {
     let target = Rc::new(RefCell::new(Target { output, fault: None }));
     let shared = Rc::clone(&target);

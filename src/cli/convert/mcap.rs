@@ -13,7 +13,6 @@ use crate::io::result_file::ResultFile;
 use crate::monitor::Estimate;
 use crate::quantity::Timestamp;
 
-/// An MCAP file being written.
 pub(super) struct McapFile {
     writer: Writer<NoSeek<ResultFile>>,
     /// Schemas of frames, error frames and estimates.
@@ -23,9 +22,8 @@ pub(super) struct McapFile {
 }
 
 impl McapFile {
-    /// Begins a file.
     pub(super) fn new(file: ResultFile) -> io::Result<Self> {
-        // The crate's compressions are other versions of zstd and lz4 than packwatch's own.
+        // The file is not compressed, because the crate would add other versions of zstd and lz4 to the program.
         let options = WriteOptions::new().compression(None).disable_seeking(true).library("packwatch");
         let mut writer = options.create(NoSeek::new(file)).map_err(fault)?;
         let mut add = |name: &str, schema: Value| writer.add_schema(name, "jsonschema", schema.to_string().as_bytes());

@@ -11,7 +11,6 @@ use crate::can::Frame;
 use crate::io::result_file::ResultFile;
 use crate::quantity::{BusIndex, Timestamp};
 
-/// Format of the output.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Format {
     Candump,
@@ -33,7 +32,6 @@ impl Format {
     }
 }
 
-/// A file being written.
 pub(super) enum Output {
     Candump(CandumpFile),
     Mf4(Box<Mf4Writer<ResultFile>>),
@@ -41,7 +39,6 @@ pub(super) enum Output {
 }
 
 impl Output {
-    /// Begins a file.
     pub(super) fn create(path: &Path, format: Format) -> io::Result<Self> {
         let file = ResultFile::create(path)?;
         Ok(match format {
@@ -51,7 +48,6 @@ impl Output {
         })
     }
 
-    /// Writes a frame of the interface with this number.
     pub(super) fn write_frame(
         &mut self,
         time: Timestamp,
@@ -81,7 +77,6 @@ impl Output {
         }
     }
 
-    /// Completes the file.
     pub(super) fn finish(self) -> io::Result<()> {
         match self {
             Self::Candump(file) => file.finish(),
@@ -91,8 +86,9 @@ impl Output {
     }
 }
 
-/// Number of a channel in MF4, from 1: that of the interface's name (`can1` is channel 2), so that reading the file
-/// gives the same names. If a name has no number, the interfaces are counted.
+/// Number of a channel in MF4, counted from 1. It is one more than the number in the interface's name (`can1` is
+/// channel 2), so that a reader of the file gives the interface the same name. If any name has no number, the
+/// interfaces are counted instead.
 fn channel(bus: BusIndex, interfaces: &[String]) -> u8 {
     let numbered = |name: &String| name.strip_prefix("can")?.parse::<u8>().ok()?.checked_add(1);
     let numbers: Option<Vec<u8>> = interfaces.iter().map(numbered).collect();

@@ -5,7 +5,6 @@ use crate::can::Frame;
 use crate::can::dbc::{Database, Message, Signal};
 use packwatch_host::failure::Failure;
 
-/// Decodes frames with a DBC.
 pub(super) struct Consumer {
     database: Database,
     unknown_frames: u64,

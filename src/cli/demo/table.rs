@@ -6,7 +6,6 @@ use std::time::Duration;
 /// Escape sequence that erases the line.
 const ERASE_LINE: &str = "\r\x1b[K";
 
-/// Writes rows to standard output.
 pub(super) struct Table {
     live: bool,
     has_head: bool,
@@ -37,12 +36,11 @@ impl Table {
         self.head()?;
         write!(io::stdout(), "{ERASE_LINE}{}", row)?;
         io::stdout().flush()?;
-        // Slow enough to be read.
+        // The pause lets the user read the row.
         std::thread::sleep(Duration::from_millis(20));
         Ok(())
     }
 
-    /// Erases the live row.
     pub(super) fn close(&self) -> io::Result<()> {
         if self.live { write!(io::stdout(), "{ERASE_LINE}") } else { Ok(()) }
     }

@@ -10,13 +10,12 @@ use packwatch_host::failure::Failure;
 /// Column where the text of a finding begins.
 const INDENT: usize = 10;
 
-/// Whether text is coloured.
 #[derive(Debug, Clone, Copy)]
 struct Paint(bool);
 
 impl Paint {
     fn with(self, code: &str, text: &str) -> String {
-        // The text may contain names from a file.
+        // A name from a file may contain control characters.
         let text = printable(text);
         if self.0 { format!("\u{1b}[{code}m{text}\u{1b}[0m") } else { text }
     }
@@ -30,7 +29,6 @@ impl Paint {
     }
 }
 
-/// Prints the report.
 pub(super) fn print(report: &WiringReport, config: &Path, source: &str) -> Result<(), Failure> {
     let is_terminal = std::io::stdout().is_terminal();
     let paint = Paint(is_terminal && std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty()));
@@ -62,7 +60,6 @@ fn proposal(change: &Change) -> String {
     }
 }
 
-/// Summarises the report in one sentence.
 fn summary(report: &WiringReport) -> String {
     let count = |severity| report.findings.iter().filter(|finding| finding.severity == severity).count();
     let many = |n: usize, one: &str| if n == 1 { format!("1 {one}") } else { format!("{n} {one}s") };
@@ -100,7 +97,6 @@ fn show(finding: &WiringFinding, width: usize, paint: Paint, page: &mut String) 
     consequences(&finding.consequences, width, paint, page);
 }
 
-/// Lists the consequences of a finding. A long list is cut.
 fn consequences(titles: &[String], width: usize, paint: Paint, page: &mut String) {
     const SHOWN: usize = 4;
     let shown = titles.iter().take(SHOWN).map(String::as_str).collect::<Vec<_>>().join("; ");
@@ -112,7 +108,6 @@ fn consequences(titles: &[String], width: usize, paint: Paint, page: &mut String
     page.push_str(&format!("{}{}\n", paint.dim(&format!("  {:8}", "below")), wrapped(&text, width, INDENT)));
 }
 
-/// Lists the lines to change. A long list is cut.
 fn changes(changes: &[Change], paint: Paint, page: &mut String) {
     const SHOWN: usize = 4;
     for change in changes.iter().take(SHOWN) {

@@ -1,4 +1,4 @@
-//! Output of `fit`: progress on the terminal, the table of residuals.
+//! Output of `fit`: progress on the terminal, and the table of residuals.
 
 use std::io::{self, Write as _};
 use std::path::Path;
@@ -8,7 +8,6 @@ use indicatif::ProgressBar;
 use crate::ident::fit::Residual;
 use crate::lab::fit::{FitOutcome, FitProgress};
 
-/// Shows the progress of the fit.
 pub(super) fn show(bar: &ProgressBar, progress: FitProgress) {
     bar.set_message(match progress {
         FitProgress::Read(done, all) => format!("read {done} of {all} files"),
@@ -17,7 +16,6 @@ pub(super) fn show(bar: &ProgressBar, progress: FitProgress) {
     bar.tick();
 }
 
-/// Prints residuals per file, notes, the verdict on the model, and the result of the fit.
 pub(super) fn table(outcome: &FitOutcome, seconds: f64, path: &Path) -> io::Result<()> {
     let names: Vec<String> = outcome.files.iter().map(|file| file.path.display().to_string()).collect();
     let width = names.iter().map(String::len).max().unwrap_or(0).max(5);

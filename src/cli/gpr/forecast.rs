@@ -75,7 +75,6 @@ struct ForecastReport<'a> {
     seconds: f64,
 }
 
-/// Runs the command.
 pub(super) fn run(args: &ForecastArgs) -> Result<(), Failure> {
     let begin = Instant::now();
     args.plots.iter().try_for_each(|folder| create_folder(folder))?;

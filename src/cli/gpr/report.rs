@@ -12,7 +12,6 @@ use crate::cli::common::progress::progress_bar;
 use crate::lab::gpr::{ColumnTable, CrossValidation, TrainedModel, peak_kib};
 use crate::regress::{FitProgress, Fold, Form, GprSettings, Hyperparameter, Jitter, PredictionScore};
 
-/// Version of the JSON documents.
 pub(super) const VERSION: u32 = 1;
 /// Number of progress steps per fit.
 const TICKS: usize = 100;
@@ -38,7 +37,6 @@ pub(super) fn show_fits(bar: &ProgressBar, fits: usize, what: &str) {
     bar.set_message(what.to_owned());
 }
 
-/// Describes the form of the covariance matrix.
 pub(super) fn form(form: Form) -> String {
     match form {
         Form::Exact => "exact".to_owned(),
@@ -70,7 +68,7 @@ fn hyperparameters(all: &[Hyperparameter]) -> Map<String, Value> {
     all.iter().map(|h| (h.name.clone(), json!(h.value))).collect()
 }
 
-/// Errors of predictions.
+/// Errors of predictions as JSON.
 pub(super) fn score_json(s: &PredictionScore) -> Value {
     json!({
         "rmse": s.rmse, "mean_absolute_error": s.mean_absolute_error, "coverage_95": s.coverage_95,
@@ -84,7 +82,6 @@ pub(super) fn short(value: f64) -> String {
     format!("{value:.digits$}")
 }
 
-/// A cross-validation.
 pub(super) struct CvReport<'a> {
     pub(super) table: &'a ColumnTable,
     pub(super) settings: &'a GprSettings,
@@ -93,7 +90,6 @@ pub(super) struct CvReport<'a> {
     pub(super) default_form: bool,
 }
 
-/// Sum over the folds.
 fn total(validated: &CrossValidation, of: impl Fn(&Fold) -> f64) -> f64 {
     validated.folds.folds.iter().map(of).sum()
 }
@@ -115,7 +111,6 @@ impl CvReport<'_> {
         &self.table.names[self.table.width() - 1]
     }
 
-    /// Prints tables.
     pub(super) fn table(&self, seconds: f64) -> io::Result<()> {
         let mut out = io::stdout().lock();
         let (rows, inputs, output) = (self.table.len(), self.inputs().join(", "), self.output());
@@ -155,7 +150,6 @@ impl CvReport<'_> {
         writeln!(out, "\n{seconds:.1} s in all")
     }
 
-    /// Prints one JSON document.
     pub(super) fn json(&self, seconds: f64) -> io::Result<()> {
         let fold = |fold: &Fold| {
             json!({
@@ -184,7 +178,6 @@ impl CvReport<'_> {
     }
 }
 
-/// Report on a trained model.
 pub(super) struct TrainReport<'a> {
     pub(super) trained: &'a TrainedModel,
     pub(super) table: &'a ColumnTable,
@@ -193,7 +186,6 @@ pub(super) struct TrainReport<'a> {
 }
 
 impl TrainReport<'_> {
-    /// Prints tables.
     pub(super) fn table(&self, path: &Path) -> io::Result<()> {
         let mut out = io::stdout().lock();
         let (trained, model) = (self.trained, &self.trained.model);
@@ -221,7 +213,6 @@ impl TrainReport<'_> {
         writeln!(out, "written to {}", path.display())
     }
 
-    /// Prints one JSON document.
     pub(super) fn json(&self) -> io::Result<()> {
         let (trained, model) = (self.trained, &self.trained.model);
         print_json(&json!({
@@ -262,7 +253,6 @@ impl PredictReport<'_> {
         if to_stderr { io::stderr().write_all(&text) } else { io::stdout().write_all(&text) }
     }
 
-    /// Prints one JSON document.
     pub(super) fn json(&self) -> io::Result<()> {
         print_json(&json!({
             "version": VERSION, "output": self.trained.output, "rows": self.table.len(), "known": self.known,

@@ -1,4 +1,4 @@
-//! Makes the configuration for a table of samples: the columns as messages, and the cell on the label.
+//! Makes the configuration for a table of samples. The columns become messages, and the label describes the cell.
 
 use std::path::Path;
 
@@ -97,7 +97,7 @@ impl PackTable {
     }
 }
 
-/// What is read of the first file as a table; `None` = it is not a table.
+/// How the first file is read as a table; `None` = it is not a table.
 fn tables(args: &Args, size: CsvOptions) -> Result<Option<TableReading>, LogError> {
     let csv = args.reading().csv_options(size);
     let encode_row = Box::new(|_: &[_], _: &mut Vec<_>| 0);

@@ -10,7 +10,6 @@ use crate::config::cell_model::SourcedModel;
 /// A model with its display name.
 type Named<'a> = (&'a str, &'a SourcedModel);
 
-/// Formats the comparison as text.
 pub(super) fn page(comparison: &ModelComparison, [first, second]: [Named<'_>; 2]) -> String {
     let name = |(source, sourced): Named<'_>| format!("{source}: {}", sourced.model.name);
     let mut page = format!("A  {}\nB  {}\n\nB less A\n", name(first), name(second));
@@ -52,7 +51,6 @@ fn signed(value: f64) -> String {
     format!("{:+.1}", (10.0 * value).round() / 10.0 + 0.0)
 }
 
-/// Formats the comparison as JSON.
 pub(super) fn document(comparison: &ModelComparison, named: [Named<'_>; 2]) -> Value {
     let [first, second] = named.map(|(source, sourced)| json!({"source": source, "name": sourced.model.name}));
     let summary =

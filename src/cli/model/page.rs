@@ -13,7 +13,6 @@ const CURVE_STEPS: u32 = 20;
 /// SOC of the resistance columns.
 const RESISTANCE_SOC: [f64; 5] = [0.1, 0.3, 0.5, 0.7, 0.9];
 
-/// The printed document of a cell model.
 #[derive(Debug, Serialize)]
 pub(super) struct ModelPage {
     version: u32,
@@ -36,7 +35,6 @@ pub(super) struct ModelPage {
     advice: Vec<AdviceRow>,
 }
 
-/// Data from which a model was learned.
 #[derive(Debug, Serialize)]
 struct LearnedRow {
     fits: u32,
@@ -49,7 +47,6 @@ struct LearnedRow {
     temperature_ranges_c: Vec<[f64; 2]>,
 }
 
-/// A change of a learned model.
 #[derive(Debug, Serialize)]
 struct ChangeRow {
     time: String,
@@ -60,7 +57,6 @@ struct ChangeRow {
     taken_back: bool,
 }
 
-/// The open-circuit curve at one SOC.
 #[derive(Debug, Serialize)]
 struct CurveRow {
     soc: f64,
@@ -72,7 +68,6 @@ struct CurveRow {
     known_by: KnownBy,
 }
 
-/// Resistances at one temperature.
 #[derive(Debug, Serialize)]
 struct ResistanceRow {
     temperature_c: f64,
@@ -99,7 +94,6 @@ struct BranchPart {
     tau_s: f64,
 }
 
-/// A measurement that would improve the model.
 #[derive(Debug, Serialize)]
 struct AdviceRow {
     measurement: String,
@@ -140,7 +134,6 @@ impl ModelPage {
         }
     }
 
-    /// Formats the page as text.
     pub(super) fn text(&self) -> String {
         let mut page = self.head();
         page.push_str("\nopen-circuit voltage at 25 \u{b0}C; \u{b1} is one standard deviation, load is C/2\n");
@@ -244,7 +237,6 @@ impl LearnedRow {
         }
     }
 
-    /// Rows of the table head.
     fn rows(&self) -> Vec<(&'static str, String)> {
         let residual =
             self.residual_v.map_or("nothing fitted yet".to_owned(), |v| format!("residuals {:.1} mV", 1e3 * v));

@@ -79,7 +79,6 @@ impl Args {
         self.results().any(|path| path == Path::new("-"))
     }
 
-    /// Checks arguments that depend on each other.
     pub(crate) fn check(&self) -> Result<(), Failure> {
         if self.each {
             // With `--each`, results are folders, which `each` checks.

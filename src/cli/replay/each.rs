@@ -23,7 +23,6 @@ use crate::io::result_file::check_place;
 use crate::monitor::Monitor;
 use crate::replay::{self, ReplayError, ReplayProgress, ReplaySummary, Sinks, in_order};
 
-/// Runs the command.
 pub(super) fn run(args: &Args, config: &Config) -> Result<(), Failure> {
     check(args)?;
     for folder in folders(args).into_iter().flatten() {
@@ -59,7 +58,6 @@ pub(super) fn run(args: &Args, config: &Config) -> Result<(), Failure> {
     if failed.is_empty() { Ok(()) } else { Err(Failure::new(failed.join("\n"))) }
 }
 
-/// Checks arguments that depend on each other.
 fn check(args: &Args) -> Result<(), Failure> {
     if args.logs.iter().any(|log| log == Path::new("-")) {
         return Err(Failure::new("-: --each cannot read standard input; give files"));
@@ -81,7 +79,6 @@ fn check(args: &Args) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Folders of the results: estimates, events, frames.
 fn folders(args: &Args) -> [Option<&Path>; 3] {
     [args.estimates.as_deref(), args.events.as_deref(), args.frames.as_deref()]
 }
@@ -186,7 +183,6 @@ impl EachBar {
     }
 }
 
-/// Progress of one log.
 struct LogProgress<'a> {
     bar: &'a EachBar,
     began: Instant,

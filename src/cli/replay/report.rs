@@ -25,7 +25,6 @@ pub(super) fn json_line(out: &mut impl Write, log: &Path, summary: &ReplaySummar
     writeln!(out)
 }
 
-/// Prints the summary as a table.
 pub(super) fn table(summary: &ReplaySummary, to_stderr: bool) -> io::Result<()> {
     let mut text = Vec::new();
     write_table(&mut text, summary)?;

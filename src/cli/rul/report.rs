@@ -1,4 +1,4 @@
-//! Output of `rul`: tables.
+//! Prints the tables of `rul`.
 
 use std::io::{self, Write};
 
@@ -6,7 +6,6 @@ use crate::cli::common::output::write_table;
 use crate::health::{Axis, Remaining};
 use crate::lab::rul::{self, CurrentForecast, ForecastScore, HistoryScore, ScoreTotal, WORST_ERROR};
 
-/// Prints a table of forecasts, each made at the end of a history.
 pub(super) fn now_table(forecasts: &[CurrentForecast]) -> io::Result<()> {
     let mut out = io::stdout().lock();
     writeln!(out, "remaining: median (5 to 95 %) from the last reading; days at the recent rate of use\n")?;
@@ -32,7 +31,6 @@ pub(super) fn now_table(forecasts: &[CurrentForecast]) -> io::Result<()> {
     Ok(())
 }
 
-/// Prints scored forecasts as a table.
 pub(super) fn scored_table(files: &[HistoryScore], alpha: f64) -> io::Result<()> {
     let mut out = io::stdout().lock();
     let percent = 100.0 * alpha;

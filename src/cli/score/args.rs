@@ -146,7 +146,6 @@ pub(crate) struct OutputArgs {
 }
 
 impl Args {
-    /// Converts the arguments to a request.
     pub(super) fn request(&self) -> ScoreRequest {
         let Self { files, config, cell, learn, columns, csv_sign, label, starts, statistics, life, output } = self;
         let charge_positive = charge_positive(*csv_sign);

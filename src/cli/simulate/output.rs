@@ -74,7 +74,6 @@ pub(super) struct TruthColumns {
     pub(super) faults: bool,
 }
 
-/// Writes the true state as CSV.
 pub(super) struct TruthWriter {
     target: Target,
     columns: TruthColumns,

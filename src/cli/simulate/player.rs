@@ -8,7 +8,6 @@ use crate::io::socket::CanSender;
 use crate::quantity::Timestamp;
 use packwatch_host::failure::Failure;
 
-/// Sends frames when they are due.
 pub(super) struct Player {
     sender: CanSender,
     speed: f64,

@@ -5,7 +5,6 @@ use crate::cli::common::numbers::{NamedValue, between, finite, integer, one_of, 
 use crate::sim::{Balancing, Fault, Hysteresis, PackSettings, Scenario, SensorQuality, Sensors, Settings, Simulation};
 use packwatch_host::failure::Failure;
 
-/// Scenarios by name.
 pub(super) const SCENARIOS: [NamedValue<Scenario>; 4] = [
     ("paper", Scenario::Paper, "2.6 Ah, 0.05 Ah lost per cycle between SOC 30 and 90 %, until 0.25 Ah"),
     ("reference", Scenario::Reference, "30 Ah example: random discharge pulses, 1 Ah lost per cycle"),
@@ -13,7 +12,6 @@ pub(super) const SCENARIOS: [NamedValue<Scenario>; 4] = [
     ("ev-day", Scenario::EvDay, "A day of an electric car: drive, park asleep, fast charge"),
 ];
 
-/// Sensor qualities by name.
 const QUALITIES: [NamedValue<SensorQuality>; 3] = [
     ("good", SensorQuality::Good, "Offset 1 mV in steps of 0.1 mV, current 0.1 % + 5 mA, 0.3 K"),
     ("usual", SensorQuality::Usual, "Offset 5 mV in steps of 1 mV, current 0.5 % + 50 mA, 1 K"),
@@ -171,11 +169,10 @@ struct SensorChanges {
 }
 
 impl Changes {
-    /// Applies the changes to `settings`.
     pub(super) fn apply(&self, settings: &mut Settings) -> Result<(), Failure> {
         settings.seed = self.seed;
         settings.cycles = self.cycles.or(settings.cycles);
-        // Only ev-day has a default duration, and a cycle of ev-day is a day.
+        // Only ev-day has a default duration. It is the duration of one cycle, which is a day.
         let days = f64::from(self.cycles.unwrap_or(1));
         settings.duration_s = self.duration.or(settings.duration_s.map(|day_s| days * day_s));
         settings.walk_steps = self.walk_steps.unwrap_or(settings.walk_steps);

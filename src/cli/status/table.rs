@@ -15,9 +15,7 @@ use crate::status::document::{Intruder, IntruderKind, StatusDocument};
 const MAX_LISTED: usize = 16;
 /// A cell can be an outlier only if its distance from the median exceeds this many times the median distance.
 const OUTLYING: f64 = 3.0;
-/// Maximum number of outliers that are listed.
 const MAX_OUTLIERS: usize = 8;
-/// Maximum number of findings that are listed.
 const MOST_FOUND: usize = 8;
 
 /// Formats the document as a table; `all` lists every cell.
@@ -117,7 +115,6 @@ fn pack(text: &mut String, document: &StatusDocument) {
     );
 }
 
-/// Describes the energy of the pack, and the time until it is empty or full.
 fn energy(values: &PackValues) -> String {
     let mut text = format!(
         "remaining {}, to full {}",
@@ -135,7 +132,6 @@ fn energy(values: &PackValues) -> String {
     text
 }
 
-/// Describes the lost lithium and active material of the weakest cell.
 fn losses(values: &PackValues) -> String {
     if values.get(Quantity::LithiumLoss).is_none() {
         return "unknown".to_owned();
@@ -148,7 +144,6 @@ fn losses(values: &PackValues) -> String {
     )
 }
 
-/// Describes the remaining life of the cell that reaches its end of life first.
 fn remaining(pack: &PackView) -> String {
     let quantities = [Quantity::RemainingCycles, Quantity::RemainingCyclesLow, Quantity::RemainingCyclesHigh];
     let [Some(cycles), Some(low), Some(high)] = quantities.map(|quantity| pack.values.mean(quantity)) else {
@@ -263,8 +258,8 @@ fn row(cell: &CellView) -> Vec<String> {
     ]
 }
 
-/// A quantity that is compared between cells: name, quantity, decimals, and two limits for an outlier's distance from
-/// the median. The distance must exceed both: the first in the quantity's unit, the second relative to the median. The
+/// A quantity that is compared between cells: name, quantity, decimals, and two limits. An outlier's distance from the
+/// median exceeds both limits. The first limit is in the quantity's unit, the second is relative to the median. The
 /// limits cover sensor errors and the spread of equal cells.
 type Comparison = (&'static str, Quantity, usize, f64, f64);
 

@@ -29,7 +29,7 @@ const DRAW_PERIOD: Duration = Duration::from_secs(1);
 /// Capacity of the key queue: more than a user types between two redraws.
 const KEYS: usize = 64;
 
-/// Runs the view until the user quits. `socket` is the status socket; the stream socket is next to it.
+/// Runs the view until the user quits. `socket` is the status socket; the stream socket is in the same folder.
 ///
 /// # Errors
 /// Fails if there is no terminal, or if the terminal fails.
@@ -85,7 +85,6 @@ async fn watch(mut terminal: DefaultTerminal, mut app: App) -> io::Result<()> {
     }
 }
 
-/// Starts a thread that reads keys and size changes.
 fn read_keys() -> io::Result<mpsc::Receiver<Event>> {
     let (sender, keys) = mpsc::channel(KEYS);
     std::thread::Builder::new().name("keys".to_owned()).spawn(move || {

@@ -13,7 +13,6 @@ use crate::lab::fleet::variants::Variant;
 use crate::lab::fleet::whatif::{LogResult, ThresholdScore};
 use crate::quantity::Timestamp;
 
-/// Version of the JSON document.
 const VERSION: u32 = 1;
 /// A column of the CSV: name and value.
 type Column = (&'static str, fn(&LogResult, &ThresholdScore) -> String);
@@ -51,7 +50,6 @@ fn text(value: Option<impl ToString>) -> String {
 }
 
 impl WhatifReport<'_> {
-    /// Prints one JSON document.
     pub(super) fn json(&self) -> io::Result<()> {
         let setting = |variant: &Variant| {
             let set = self.grid.keys.iter().cloned().zip(variant.values.iter().map(|value| json!(value)));
@@ -79,7 +77,6 @@ impl WhatifReport<'_> {
         }))
     }
 
-    /// Writes a row per log, setting and alarm.
     pub(super) fn csv(&self, path: &Path) -> io::Result<()> {
         let mut out = csv::Writer::from_writer(ResultFile::create(path)?);
         let keys = self.grid.keys.iter().map(String::as_str);

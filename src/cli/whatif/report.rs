@@ -17,12 +17,10 @@ const SUMMARY_HEADS: [&str; OWN_COLUMNS] =
 const LOG_HEADS: [&str; OWN_COLUMNS] =
     ["threshold", "raised", "at day", "cycle", "cell", "value", "lead, days", "lead, cycles", "judged"];
 
-/// Results with their settings.
 pub(super) struct WhatifReport<'a> {
     pub(super) grid: &'a VariantGrid,
     pub(super) settings: &'a WhatifSettings<'a>,
     pub(super) rated_ah: f64,
-    /// Rules to show.
     pub(super) rules: &'a [Rule],
     pub(super) logs: &'a [&'a LogResult],
     /// One error message for each log that failed.
@@ -49,7 +47,6 @@ pub(super) struct Summary {
 }
 
 impl WhatifReport<'_> {
-    /// Prints the tables.
     pub(super) fn table(&self, each: bool) -> io::Result<()> {
         if self.logs.is_empty() {
             return Ok(());
@@ -172,7 +169,6 @@ impl WhatifReport<'_> {
         log.alarms.iter().filter(|row| self.rules.contains(&row.rule))
     }
 
-    /// Summarises the results of each threshold with each setting, over all logs.
     pub(super) fn summaries(&self) -> Vec<Summary> {
         let Some(first) = self.logs.first() else { return Vec::new() };
         // Every log has the same rows in the same order.
@@ -207,8 +203,8 @@ fn summary(rows: &[&ThresholdScore]) -> Summary {
     }
 }
 
-/// Median, 5 % and 95 % quantiles. Each quantile is the nearest existing value; of two middle values, the lower one is
-/// used.
+/// Median, 5 % and 95 % quantiles. Each quantile is the nearest existing value. If the median lies between two values,
+/// the lower value is used.
 fn quantiles(mut values: Vec<f64>) -> Option<[f64; 3]> {
     values.sort_by(f64::total_cmp);
     let last = values.len().checked_sub(1)?;

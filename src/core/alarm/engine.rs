@@ -221,8 +221,8 @@ impl AlarmEngine {
         self.each_threshold(rule, cell, changes, |machine, config| machine.observe(now, config, observation));
     }
 
-    /// Whether `worst` and all better values of `rule` leave every alarm of the rule unchanged, because all these
-    /// alarms are at rest and `worst` is healthy. Returns true if the rule is not configured.
+    /// Whether all alarms of `rule` are at rest and `worst` is healthy. If so, `worst` and all better values leave
+    /// these alarms unchanged. Returns true if the rule is not configured.
     pub fn is_quiet(&self, rule: Rule, worst: f64) -> bool {
         self.rules[self.by_rule[usize::from(rule as u8)].clone()].iter().all(|slots| {
             let is_beyond = || LimitCheck::of(&slots.config, &Observation::new(Some(worst))).0 != LimitCheck::Healthy;

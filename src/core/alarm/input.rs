@@ -1,10 +1,10 @@
 //! Represents every input of an alarm engine as a value, so that another engine can replay the same inputs.
 //!
 //! In: the inputs that the [`Monitor`](crate::monitor::Monitor) passes to its engine. Out: changes of alarms. The
-//! inputs do not depend on the thresholds. Therefore an engine with other thresholds that replays the inputs reports
-//! the same changes as a monitor with those thresholds. Exception: until a CAN signal gives its first reading after a
-//! start or a sleep, the monitor passes the signal's silence to `input_missing` only if the silence exceeds the lowest
-//! threshold.
+//! inputs do not depend on the thresholds. If an engine with other thresholds replays the inputs, it therefore reports
+//! the same changes as a monitor with those thresholds. The rule `input_missing` is an exception. Until a CAN signal
+//! gives its first reading after a start or a sleep, the monitor passes the signal's silence to this rule only if the
+//! silence exceeds the lowest threshold.
 
 use super::engine::{AlarmChange, AlarmEngine};
 use super::limit::Observation;

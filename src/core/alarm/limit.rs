@@ -1,23 +1,23 @@
-//! Compares a value with a rule's set threshold, which raises the alarm, and its clear threshold, which clears the
-//! alarm. The outcome is beyond, between, healthy or unknown.
+//! Compares a value with the two thresholds of a rule. The set threshold raises the alarm, and the clear threshold
+//! clears it. The outcome is beyond, between, healthy or unknown.
 //!
 //! A rule compares the value itself (`when = "mean"`), or the probability P that the true value is beyond the threshold
 //! (`when = { probability = p }`). For P, the value is assumed to be normally distributed with its standard deviation.
-//! The outcome is
+//! The outcome follows from two probabilities:
 //!
 //! ```text
 //! beyond    P(truth beyond the set threshold)   >  p
 //! healthy   P(truth beyond the clear threshold) <= min(p, c)
 //! ```
 //!
-//! where c is 0.05 for a learned value and 0.5 otherwise. Therefore only a value at the clear threshold or better
-//! clears an alarm; a growing uncertainty does not. The clear threshold is never on the bad side of the set threshold.
-//! Therefore the second probability is never below the first, and no value is beyond and healthy at the same time. With
-//! p = 0.5, the result is the same as for `when = "mean"`. If the standard deviation is needed but missing, the result
-//! is unknown.
+//! Here, c is 0.05 for a learned value and 0.5 for other values. Only a value at the clear threshold or better
+//! therefore clears an alarm; a growing uncertainty does not. The clear threshold is never on the bad side of the set
+//! threshold, so the second probability is never below the first. A value is therefore never beyond and healthy at the
+//! same time. With p = 0.5, the result is the same as for `when = "mean"`. If the standard deviation is needed but
+//! missing, the result is unknown.
 //!
 //! A learned value (a capacity, a resistance, a remaining life) does not recover by itself. Therefore c also applies to
-//! `when = "mean"`: an estimate that fluctuates around its threshold must not clear its alarm.
+//! `when = "mean"`, so that an estimate that fluctuates around its threshold does not clear its alarm.
 
 use serde::{Deserialize, Serialize};
 
@@ -185,11 +185,11 @@ mod tests {
 
     #[test]
     fn probability_follows_normal_distribution() {
-        // 95 % is at 1.645 standard deviations.
+        // A probability of 95 % is at 1.645 standard deviations.
         let rule = low(Comparison::Probability(0.95));
         assert_eq!(check(&rule, 1.4 - 0.1 * 1.65, Some(0.1)), LimitCheck::Beyond);
         assert_eq!(check(&rule, 1.4 - 0.1 * 1.64, Some(0.1)), LimitCheck::Between);
-        // A value at the clear threshold clears the alarm, a growing uncertainty does not.
+        // A value at the clear threshold clears the alarm. A growing uncertainty does not.
         assert_eq!(check(&rule, 1.5 - 0.1 * 1.64, Some(0.1)), LimitCheck::Between);
         assert_eq!(check(&rule, 1.2, Some(10.0)), LimitCheck::Between);
         let soc = RuleConfig { rule: Rule::SocLow, ..rule.clone() };
@@ -218,7 +218,7 @@ mod tests {
     fn learned_value_clears_at_95_percent_certainty() {
         let rule = low(Comparison::Mean);
         assert_eq!(check(&rule, 1.4 - 1e-9, Some(0.1)), LimitCheck::Beyond);
-        // 95 % is at 1.645 standard deviations.
+        // A probability of 95 % is at 1.645 standard deviations.
         assert_eq!(check(&rule, 1.5 + 0.1 * 1.64, Some(0.1)), LimitCheck::Between);
         assert_eq!(check(&rule, 1.5 + 0.1 * 1.65, Some(0.1)), LimitCheck::Healthy);
         let soc = RuleConfig { rule: Rule::SocLow, ..rule };

@@ -25,11 +25,11 @@
 //!
 //! Time counts only between two observations of known values on the same side. The time between a known and an unknown
 //! value does not count. For a learned value, time also counts up to each poll, because the value stays valid. An
-//! unknown value does not reset the count; otherwise, a flickering input could prevent an alarm forever.
+//! unknown value does not reset the count, because otherwise an intermittent input could prevent an alarm forever.
 //!
-//! The end of an alarm and the change to `suppressed` are limited: [`QUICK_ENDS`] in short succession, then one per
-//! [`END_PERIOD_S`]. Until one is allowed, the alarm stays raised and no change is published; cyclic frames still show
-//! an unknown value as `suppressed`. A flickering input therefore fills neither the bus nor the history.
+//! An alarm may end, or change to `suppressed`, only [`QUICK_ENDS`] times in short succession and then once per
+//! [`END_PERIOD_S`]. Until this is allowed, the alarm stays raised and no change is published. Cyclic frames still show
+//! an unknown value as `suppressed`. An intermittent input therefore does not flood the bus or the history.
 
 use serde::{Deserialize, Serialize};
 use strum::IntoStaticStr;
@@ -37,7 +37,7 @@ use strum::IntoStaticStr;
 use super::limit::{LimitCheck, Observation, RuleConfig};
 use crate::quantity::Timestamp;
 
-/// Number of ends in short succession. A person at work on the vehicle causes fewer.
+/// Number of ends (including changes to `suppressed`) in short succession. Work on the vehicle causes fewer ends.
 const QUICK_ENDS: i64 = 120;
 /// Time between further ends, s. An alarm then changes at most 288 times a day.
 const END_PERIOD_S: f64 = 600.0;
@@ -130,7 +130,6 @@ pub(super) struct Machine {
     /// Probability that the true value is beyond the threshold; `None` = unknown.
     #[serde(skip)]
     pub(super) probability: Option<f64>,
-    /// How often the alarm was raised since its history was last forgotten.
     pub(super) occurrences: u32,
     /// Times of the comparisons that raised the alarm first and last, and the value that raised it last.
     pub(super) first_raised: Timestamp,
@@ -156,7 +155,6 @@ pub(super) struct Machine {
 pub(super) struct IndexEntry {
     pub(super) is_known: bool,
     pub(super) is_raised: bool,
-    /// Whether a debounce is running.
     pub(super) is_counting: bool,
     /// Whether only a value beyond the threshold or an unknown value can change the alarm.
     pub(super) is_at_rest: bool,
@@ -180,9 +178,9 @@ impl Machine {
         (self.observation, self.probability) = (Observation { value: Some(value), ..Observation::default() }, None);
     }
 
-    /// Handles a value. When the inputs of a learned value are lost, the running half-cycle ends, and its result may
-    /// still arrive as a new value. This value may raise the alarm. If the alarm is suppressed, the value does not
-    /// change its state; otherwise, the value would clear the alarm or make it look up to date.
+    /// Handles a value. When the inputs of a learned value are lost, the half-cycle in progress ends, and its result
+    /// may still arrive as a new value. This value may raise the alarm. A suppressed alarm stays suppressed, because
+    /// the value would clear the alarm or make it look up to date.
     pub(super) fn observe(&mut self, now: Timestamp, rule: &RuleConfig, observation: &Observation) -> Option<Change> {
         self.observation = *observation;
         if self.is_suspended && self.shown() == AlarmState::Suppressed {

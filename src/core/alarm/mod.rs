@@ -3,7 +3,7 @@
 //!
 //! In: commands, and the values of each rule per cell or per pack, in the rule's unit (`None` = unknown). Out: changes
 //! of alarms. An unknown value neither raises nor clears an alarm, but the alarm's state shows that the value is
-//! unknown. The engine stores at most one alarm per threshold for the pack and one for each cell. States and
+//! unknown. For each threshold, the engine stores at most one alarm for the pack and one alarm per cell. States and
 //! transitions follow ISA-18.2 (unacknowledged, latched, suppressed).
 //! * [`rule`] specifies what each rule compares;
 //! * [`limit`] compares a value with a threshold;

@@ -51,7 +51,8 @@ pub enum Rule {
     /// A voltage channel does not show its own cell. The value is 1 in this case, else 0. While the value is 1, the
     /// rules that depend on the cell's voltage are unknown.
     ChannelFaulty = 17,
-    /// A cell's voltage collapses (1), a temperature of the cell rises faster than the current explains (2), or both (3); else 0.
+    /// Signs of a thermal event in a cell. The value is 1 if the cell's voltage collapses, 2 if a temperature of the
+    /// cell rises faster than the current explains, 3 for both, else 0.
     ThermalEvent = 18,
 }
 
@@ -118,8 +119,8 @@ pub struct RuleSpec {
     pub has_deviation: bool,
     /// Whether a value stays valid until the next value arrives, so that the time debounce continues between values.
     ///
-    /// A learned value stays valid: a capacity stays low until the next cycle. A measured value does not, because
-    /// without new data, the old value proves nothing.
+    /// A learned value, such as a capacity, stays valid until it is learned again. A measured value does not, because
+    /// an old value proves nothing without new data.
     pub is_learned: bool,
     /// Name of the compared quantity, for messages.
     pub about: &'static str,

@@ -1,16 +1,13 @@
-//! Parses DBC text to messages and signals.
+//! Parses the text of a DBC file into messages and signals.
 //!
-//! In: the text of a DBC file (grammar: the `can-dbc` crate). Out: a [`Database`] of messages and signals, with value
-//! tables, units, cycle times, frame formats and end-to-end protection. Multiplexing becomes conditions on the raw
-//! codes of multiplexors. [`Database::to_dbc`] writes a database as text, and parsing this text gives an equal
-//! database.
+//! In: text in the grammar of the `can-dbc` crate. Out: a [`Database`]. [`Database::to_dbc`] writes a database as text
+//! that parses to an equal database.
 //!
-//! The parser leaves out a message, and keeps a [`DbcError`] with its line, in four cases: its text does not follow the
-//! grammar, a number is out of range or not finite, a name is defined twice, or multiplexing cannot be resolved. A text
-//! that does not follow the grammar and has no usable message is an error. The parser accepts a signal that extends beyond its
-//! message. If a frame has the message's length, decoding this signal gives
-//! [`Fault::ShortFrame`](crate::quantity::Fault::ShortFrame). The parser also accepts an invalid layout, which
-//! [`SignalLayout::plan`] rejects.
+//! The parser leaves out a message if its text does not follow the grammar, a number is out of range or not finite, a
+//! name is defined twice, or the multiplexing cannot be resolved. [`Database::left_out`] lists these faults with their
+//! lines. If a text has no usable message and does not follow the grammar, parsing fails. A signal may extend beyond
+//! its message. A frame of the message's length then gives [`Fault::ShortFrame`](crate::quantity::Fault::ShortFrame). A
+//! signal layout may be invalid: [`SignalLayout::plan`] rejects it.
 
 use std::collections::{HashMap, HashSet};
 
@@ -23,36 +20,34 @@ mod attributes;
 mod statements;
 mod write;
 
-/// Name of the pseudo message in which editors keep signals without a message.
+/// Pseudo message in which editors keep signals without a message.
 const PSEUDO_MESSAGE: &str = "VECTOR__INDEPENDENT_SIG_MSG";
 
-/// Maximum number of left-out messages and statements that are listed one by one. A file with more is probably not a
-/// DBC, and more lines are not read.
+/// Maximum number of faults that are listed individually. A text with more faults is probably not a DBC.
 const MAX_LISTED: usize = 20;
 
-/// Maximum nesting of multiplexors; deeper nesting counts as a loop.
+/// Maximum nesting depth of multiplexors. Deeper nesting is rejected as a loop.
 const MAX_MULTIPLEX_DEPTH: usize = 8;
 
 /// Reason why a text is not a usable DBC, or why a part of it is left out.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("line {line}: {what}")]
 pub struct DbcError {
-    /// Line number, counted from 1.
+    /// Counted from 1.
     pub line: usize,
-    /// The fault: what was found and what is allowed.
     pub what: String,
 }
 
 /// Messages of one DBC, in the file's order.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Database {
-    /// Nodes on the bus (`BU_`).
+    /// From `BU_`.
     pub nodes: Vec<String>,
-    /// Comment on the whole database (`CM_`).
+    /// From `CM_` without an object.
     pub comment: Option<String>,
     pub messages: Vec<Message>,
-    /// Messages and statements of the text that are not usable and therefore left out, sorted by line; the last entry
-    /// counts those beyond 20.
+    /// Unusable messages and statements, sorted by line. If there are more than 20, entry 21 gives the number of the
+    /// rest.
     pub left_out: Vec<DbcError>,
 }
 
@@ -63,88 +58,77 @@ pub enum FrameFormat {
     #[default]
     Classic,
     /// CAN FD frame, at most 64 bytes.
-    Fd {
-        /// Whether the data phase uses the higher bit rate.
-        brs: bool,
-    },
+    Fd { brs: bool },
 }
 
-/// How a message is repeated after an event; `None` = 0, or not stated in the DBC.
+/// How a message is repeated after an event. `None` = 0, or not stated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Repetition {
-    /// Number of frames after the first frame (`GenMsgNrOfRepetition`).
+    /// Number of frames after the event's first frame (`GenMsgNrOfRepetition`).
     pub count: Option<u32>,
-    /// Time between these frames, ms (`GenMsgCycleTimeFast`).
+    /// Time between the repeated frames, ms (`GenMsgCycleTimeFast`).
     pub period_ms: Option<u32>,
-    /// Smallest mean time between two frames of the message, ms (`GenMsgDelayTime`).
+    /// Minimum average time between two frames of the message, ms (`GenMsgDelayTime`).
     pub delay_ms: Option<u32>,
 }
 
-/// One message.
+/// One message of a DBC.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Message {
-    /// Identifier; extended if bit 31 of the number in the DBC is set.
+    /// Extended if bit 31 of the number in the DBC is set.
     pub id: CanId,
-    /// Name, unique in its database.
+    /// Unique in the database.
     pub name: String,
-    /// Payload length in the DBC, bytes.
+    /// Payload length, bytes.
     pub len_bytes: u16,
-    /// Sending node.
     pub sender: Option<String>,
-    /// Kind of frame (`VFrameFormat` and `CANFD_BRS`).
+    /// From `VFrameFormat` and `CANFD_BRS`.
     pub format: FrameFormat,
     /// Whether the identifier stands for a J1939 parameter group, which any source address may send (`VFrameFormat`).
     pub is_j1939: bool,
-    /// End-to-end protection (`E2EProfile` and `E2EDataId`, packwatch's own attributes).
+    /// From `E2EProfile` and `E2EDataId`, packwatch's own attributes.
     pub e2e: Option<Protection>,
-    /// Authentication (`SecOCProfile` and `SecOCDataId`, packwatch's own attributes).
+    /// From `SecOCProfile` and `SecOCDataId`, packwatch's own attributes.
     pub secoc: Option<Authentication>,
-    /// Signals in the file's order.
     pub signals: Vec<Signal>,
-    /// Cycle time, ms, if above 0 (`GenMsgCycleTime` or its default).
+    /// Cycle time, ms, above 0 (`GenMsgCycleTime` or its default).
     pub cycle_time_ms: Option<u32>,
-    /// Repetition after an event.
     pub repetition: Repetition,
-    /// Comment on the message (`CM_ BO_`).
+    /// From `CM_ BO_`.
     pub comment: Option<String>,
 }
 
-/// One signal.
+/// One signal of a message.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Signal {
-    /// Name, unique in its message.
+    /// Unique in the message.
     pub name: String,
-    /// Position and scaling.
     pub layout: SignalLayout,
-    /// Unit as written; may be empty.
+    /// May be empty.
     pub unit: String,
-    /// Receiving nodes.
     pub receivers: Vec<String>,
-    /// Conditions that must all hold for the signal to be present, outermost multiplexor first.
+    /// Conditions for the signal to be present, outermost multiplexor first. All of them must hold.
     pub conditions: Vec<MuxCondition>,
     /// Whether the presence of other signals depends on this signal.
     pub is_multiplexor: bool,
-    /// Raw values (signed for signed signals) and their names (`VAL_`).
+    /// Raw values and their names (`VAL_`).
     pub values: Vec<(i64, String)>,
-    /// Comment on the signal (`CM_ SG_`).
+    /// From `CM_ SG_`.
     pub comment: Option<String>,
 }
 
 /// Condition on one multiplexor.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct MuxCondition {
-    /// Index of the multiplexor in its message's `signals`.
+    /// Index in the message's `signals`.
     pub selector: usize,
-    /// Ranges of raw codes, ends included. One of the ranges must contain the selector's code.
+    /// Ranges of raw codes, ends included. The selector's code must be in one of them.
     pub ranges: Vec<(u64, u64)>,
 }
 
 impl Database {
-    /// Parses the text of a DBC. Messages and statements that are not usable are left out and listed in
-    /// [`Self::left_out`].
-    ///
-    /// # Errors
-    /// Returns the first fault with its line if the text does not follow the grammar and has no usable message.
+    /// Parses the text of a DBC. Returns the first fault if the text has no usable message and does not follow the
+    /// grammar.
     pub fn parse(text: &str) -> Result<Self, DbcError> {
         let text = text.strip_prefix('\u{feff}').unwrap_or(text);
         // The grammar requires a line end after every statement.
@@ -166,17 +150,14 @@ impl Database {
         Ok(Self { nodes, comment: plain_comment(&dbc), messages, left_out })
     }
 
-    /// Parses the bytes of a DBC file: UTF-8 (with or without a byte-order mark), or Latin-1 if they are not valid
-    /// UTF-8. A DBC does not state its encoding.
-    ///
-    /// # Errors
-    /// Returns the errors of [`Self::parse`], and an error for UTF-16 text.
+    /// Parses a DBC file. Bytes that are not valid UTF-8 are parsed as Latin-1, because a DBC does not state its
+    /// encoding. UTF-16 is an error.
     pub fn parse_bytes(bytes: &[u8]) -> Result<Self, DbcError> {
         if is_utf_16(bytes) {
             let what = "the file is UTF-16 text, must be UTF-8 or Latin-1: save it in one of these encodings";
             return Err(DbcError { line: 1, what: what.to_owned() });
         }
-        // Remove the UTF-8 byte-order mark. Some editors put it before Latin-1 text, too.
+        // Remove the UTF-8 byte-order mark, because some editors also put it before Latin-1 text.
         let bytes = bytes.strip_prefix(b"\xEF\xBB\xBF").unwrap_or(bytes);
         match std::str::from_utf8(bytes) {
             Ok(text) => Self::parse(text),
@@ -184,12 +165,12 @@ impl Database {
         }
     }
 
-    /// The message with the given name.
+    /// Finds a message by name.
     pub fn message(&self, name: &str) -> Option<&Message> {
         self.messages.iter().find(|message| message.name == name)
     }
 
-    /// The signal with the given full name, `Message.Signal`, and its message.
+    /// Finds a signal and its message by full name (`Message.Signal`).
     pub fn signal(&self, full_name: &str) -> Option<(&Message, &Signal)> {
         let (message, signal) = full_name.split_once('.')?;
         let message = self.message(message)?;
@@ -197,21 +178,21 @@ impl Database {
     }
 }
 
-/// Whether the bytes start with a UTF-16 byte-order mark, or with a Latin letter in UTF-16.
+/// Whether the bytes start like UTF-16: with a byte-order mark or a Latin letter.
 fn is_utf_16(bytes: &[u8]) -> bool {
     matches!(bytes, [0xFF, 0xFE, ..] | [0xFE, 0xFF, ..] | [0, _, ..] | [_, 0, ..])
 }
 
 impl Message {
-    /// The signal with the given name.
+    /// Finds a signal by name.
     pub fn signal(&self, name: &str) -> Option<&Signal> {
         self.signals.iter().find(|signal| signal.name == name)
     }
 }
 
 impl Signal {
-    /// Raw codes (the signal's bits) that the value table calls "not available", "signal not available", "n/a" or
-    /// "SNA". Ignores case and treats `_` as a blank.
+    /// Raw codes whose name in the value table is "not available", "signal not available", "n/a" or "SNA". Ignores
+    /// case; `_` counts as a blank.
     pub fn not_available_codes(&self) -> Vec<u64> {
         let mask = u64::MAX >> (64 - u32::from(self.layout.length_bits.clamp(1, 64)));
         let says_so = |name: &str| {
@@ -222,9 +203,7 @@ impl Signal {
     }
 }
 
-/// A fault of a message or signal, before the line of the fault is known.
 struct MessageFault {
-    /// Number of the message in the DBC.
     id: u32,
     message: String,
     signal: Option<String>,
@@ -232,7 +211,7 @@ struct MessageFault {
 }
 
 impl MessageFault {
-    /// Adds the line of the last definition of the message or signal, and states that the message is left out.
+    /// Adds the line of the last definition of the message or signal.
     fn at(self, text: &str) -> DbcError {
         let (mut line, mut inside) = (1, false);
         for (number, content) in (1..).zip(text.lines()) {
@@ -261,7 +240,6 @@ struct Details<'a> {
     multiplex: Vec<&'a can_dbc::ExtendedMultiplex>,
 }
 
-/// [`Details`] by message and signal.
 struct DetailTable<'a>(HashMap<(can_dbc::MessageId, &'a str), Details<'a>>);
 
 impl<'a> DetailTable<'a> {
@@ -296,7 +274,7 @@ impl<'a> DetailTable<'a> {
     }
 }
 
-/// The usable messages, in the file's order. If several messages have one name, the first is used.
+/// The usable messages, in the file's order. Of several messages with the same name, only the first is returned.
 fn read_messages(dbc: &can_dbc::Dbc, text: &str, left_out: &mut Vec<DbcError>) -> Vec<Message> {
     let details = DetailTable::new(dbc);
     let mut names = HashSet::new();
@@ -336,7 +314,7 @@ fn read_message<'a>(
         can_dbc::MessageId::Extended(id) => CanId::extended(id),
     };
     let id = id.ok_or_else(|| fault(None, "the identifier is out of range".to_owned()))?;
-    // A length above 64 bytes is kept: J1939 DBCs describe transport messages of up to 1,785 bytes.
+    // J1939 DBCs describe transport messages of up to 1,785 bytes, so lengths above 64 bytes are valid.
     let len_bytes =
         u16::try_from(message.size).map_err(|_| fault(None, format!("length {}, must be 0 to 65535", message.size)))?;
     let signals: Result<Vec<_>, _> =
@@ -414,8 +392,8 @@ fn read_signal<'a>(
     })
 }
 
-/// The minimum of a signal. Some files state the size of both ends instead: "[0|819.2]" of a signal with the offset -819.2
-/// means -819.2 to 819.2.
+/// The minimum of a signal. Some files state only the magnitude of both ends, such as "[0|819.2]" for a signal with the
+/// offset -819.2. This range means -819.2 to 819.2.
 fn lowest(layout: &SignalLayout) -> f64 {
     let is_size = layout.minimum == 0.0 && layout.offset < 0.0 && layout.maximum > 0.0;
     let is_symmetrical = (layout.offset + layout.maximum).abs() <= 0.01 * layout.maximum;
@@ -430,9 +408,8 @@ fn number(value: &can_dbc::NumericValue) -> f64 {
     }
 }
 
-/// The conditions from the outermost multiplexor down to this signal. `SG_MUL_VAL_` names the parent and the ranges,
-/// and takes precedence over the number after `m`. Without `SG_MUL_VAL_`, the parent is the only multiplexor (`M`) of
-/// the message.
+/// The conditions of a signal, from the outermost multiplexor inwards. An `SG_MUL_VAL_` line gives the parent and the
+/// ranges, and overrides the number after `m`. Without this line, the parent is the message's only multiplexor (`M`).
 fn conditions<'a>(
     details: &DetailTable<'a>,
     message: &'a can_dbc::Message,

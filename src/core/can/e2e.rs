@@ -1,8 +1,8 @@
 //! AUTOSAR end-to-end protection: Profile 1 (variants A and C) and Profile 5, for senders and receivers.
 //!
 //! A protected payload starts with a header: a CRC and a counter. The CRC covers the rest of the payload and a data
-//! identifier, on which sender and receiver agree. The counter increases by one with each frame. The header lets the
-//! receiver detect payloads that are damaged, repeated, lost or from another message. It does not stop an attacker,
+//! identifier that sender and receiver have agreed on. The counter increases by one with each frame. The receiver
+//! detects payloads that are damaged, repeated, lost or from another message. The protection does not stop an attacker,
 //! because anybody can compute a CRC.
 //!
 //! | profile | header | CRC and its start value | bytes that the CRC covers, in this order | counter |
@@ -11,27 +11,27 @@
 //! | 1C | as 1A; byte 1, high nibble: bits 8 to 11 of the id | CRC-8 0x1D, 0 | id low, 0, payload from byte 1 | 0 to 14 |
 //! | 5 | bytes 0 and 1: CRC, low byte first; byte 2: counter | CRC-16 0x1021, 0xFFFF | payload from byte 2, id low, id high | 0 to 255 |
 //!
-//! In 1A the high nibble of byte 1 is free for a signal of the message; `protect` does not change it. AUTOSAR computes
-//! the CRC of profile 1 with the CRC-8 of its library, but cancels the library's start value and final XOR (both 0xFF).
-//! The table shows the result.
+//! In 1A, a signal of the message may use the high nibble of byte 1; `protect` does not change it. AUTOSAR computes the
+//! CRC of profile 1 with the CRC-8 of its library, but cancels the library's start value and final XOR (both 0xFF). The
+//! table shows the resulting CRC.
 //!
-//! A sender rejects a payload that is shorter than the header; a receiver reports such a payload as a wrong CRC.
-//! Source: AUTOSAR "SWS E2E Library", as implemented by two test peers and four open-source receivers; vectors in the
-//! tests.
+//! A sender rejects a payload that is shorter than the header. A receiver reports such a payload as a wrong CRC.
+//! Source: AUTOSAR "SWS E2E Library". Two test peers and four open-source receivers implement it in this way; the tests
+//! contain vectors.
 //!
-//! * Deviation 1: in AUTOSAR, the check of profile 5 has no statuses SYNC and INITIAL; the state machine above it
-//!   provides them. Here, profile 5 uses the receiver of profile 1 with the counter modulo 256, so that both profiles
-//!   have the same statuses and counts. Effects: the first frame of profile 5 is INITIAL and not used, although
-//!   AUTOSAR's check alone might return OK. While frames are missing, the allowed step of the counter grows. As in
-//!   AUTOSAR's check of profile 5, the sequence continues from a counter that jumped too far. Therefore, a restart of
-//!   the sender costs one frame instead of up to 256.
-//! * Deviation 2: the largest value of the setting for repetitions (`max_no_new_or_repeated_data`) is 14 for both
-//!   profiles, and 14 means "any number".
-//! * Deviation 3: AUTOSAR calls its check once a period, with or without a frame. Here it is called once per frame and,
-//!   if the period is known, once for each period without a frame. If the period is unknown, the allowed step grows
-//!   only with frames that are not accepted.
-//! * Deviation 4: in AUTOSAR, the counter 15 of profile 1, which no sender may use, has no status (the check returns an
-//!   error). Here it is [`Status::WrongCrc`], because no valid sender creates such a payload.
+//! * Deviation 1: profile 5 uses the receiver of profile 1 with the counter modulo 256, so that both profiles have the
+//!   same statuses and counts. In AUTOSAR, the check of profile 5 has no statuses SYNC and INITIAL; a separate state
+//!   machine provides them. Effects: the first frame of profile 5 is INITIAL and not used, although AUTOSAR's check
+//!   alone might return OK. While frames are missing, the allowed step of the counter grows. If the counter jumps too
+//!   far, the sequence continues from the new counter, as in AUTOSAR. Therefore, a restart of the sender costs one
+//!   frame instead of up to 256.
+//! * Deviation 2: the setting for repetitions (`max_no_new_or_repeated_data`) is at most 14 for both profiles, and 14
+//!   means "any number".
+//! * Deviation 3: AUTOSAR calls its check once per period, with or without a frame. Here, it is called once per frame.
+//!   If the period is known, it is also called for each period without a frame. If the period is unknown, the allowed
+//!   step grows only with frames that are not accepted.
+//! * Deviation 4: AUTOSAR's check returns an error without a status for the counter 15 of profile 1, which no sender
+//!   may use. Here, the status is [`Status::WrongCrc`].
 
 mod receiver;
 
@@ -42,13 +42,12 @@ pub use receiver::{CheckConfig, Receiver, Status, StatusCounts};
 /// Profile of end-to-end protection: layout of the header, CRC and range of the counter.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub enum Profile {
-    /// Profile 1, variant A: the data identifier is included in the CRC and not sent.
+    /// Variant A: the data identifier is included in the CRC and not sent.
     #[serde(rename = "1A")]
     P01A,
-    /// Profile 1, variant C: four bits of the data identifier are sent, and its low byte is included in the CRC.
+    /// Variant C: four bits of the data identifier are sent, and its low byte is included in the CRC.
     #[serde(rename = "1C")]
     P01C,
-    /// Profile 5.
     #[serde(rename = "5")]
     P05,
 }
@@ -63,7 +62,7 @@ impl Profile {
         }
     }
 
-    /// Bits of the first three bytes that the protection writes; bit 0 is the least significant bit of a byte.
+    /// Bits of the first three bytes that the protection writes.
     pub const fn header_mask(self) -> [u8; 3] {
         match self {
             Self::P01A => [0xFF, 0x0F, 0],
@@ -72,7 +71,7 @@ impl Profile {
         }
     }
 
-    /// Shortest payload that can be protected, bytes.
+    /// Shortest protectable payload, bytes.
     pub const fn header_bytes(self) -> usize {
         match self {
             Self::P01A | Self::P01C => 2,
@@ -80,7 +79,7 @@ impl Profile {
         }
     }
 
-    /// Longest payload that the profile may protect, bytes: 240 bits for profile 1, any frame for profile 5.
+    /// Longest protectable payload, bytes: 240 bits for profile 1, any frame for profile 5.
     pub const fn max_bytes(self) -> usize {
         match self {
             Self::P01A | Self::P01C => 30,
@@ -104,13 +103,12 @@ impl Profile {
         }
     }
 
-    /// The counter after `counter`. The largest counter and any invalid counter are followed by 0.
+    /// The counter after `counter`. The largest and invalid counters are followed by 0.
     pub const fn next_counter(self, counter: u8) -> u8 {
         if counter < self.max_counter() { counter + 1 } else { 0 }
     }
 
-    /// Number of steps from the counter `from` to the counter `to`, 0 to the largest counter. `from` and `to` must be
-    /// valid counters.
+    /// Number of steps between two valid counters.
     const fn counter_delta(self, from: u8, to: u8) -> u8 {
         if to >= from { to - from } else { self.max_counter().wrapping_sub(from).wrapping_add(to).wrapping_add(1) }
     }
@@ -124,18 +122,14 @@ pub struct ProtectError(String);
 /// Protection of one message, as agreed between sender and receiver.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct Protection {
-    /// Layout, CRC and counter.
     pub profile: Profile,
-    /// Data identifier, unique among messages. Variant 1C uses only its lower 12 bits.
+    /// Unique among messages. Variant 1C uses only the lower 12 bits.
     pub data_id: u16,
 }
 
 impl Protection {
-    /// Writes counter, identifier nibble (1C) and CRC to a payload whose other bytes are final.
-    ///
-    /// # Errors
-    /// The payload is shorter than the header, or the counter is above the profile's largest counter. The payload is
-    /// then unchanged.
+    /// Writes counter, identifier nibble (1C) and CRC to a payload. All other bytes must be final. Leaves the payload
+    /// unchanged if it is shorter than the header or the counter is too large.
     pub fn protect(&self, payload: &mut [u8], counter: u8) -> Result<(), ProtectError> {
         let (found, needed, max) = (payload.len(), self.profile.header_bytes(), self.profile.max_counter());
         if found < needed {
@@ -161,7 +155,7 @@ impl Protection {
         Ok(())
     }
 
-    /// The counter of a valid payload; `None` = the CRC, the identifier or the counter is invalid.
+    /// The counter of a valid payload; `None` = CRC, identifier or counter is invalid.
     pub fn verified_counter(&self, payload: &[u8]) -> Option<u8> {
         let counter = self.counter(payload)?;
         let intact = match self.profile {
@@ -172,7 +166,7 @@ impl Protection {
         (intact && counter <= self.profile.max_counter()).then_some(counter)
     }
 
-    /// The counter in the payload, even if the CRC is wrong; `None` = the payload is too short.
+    /// The counter in a payload, even if the CRC is wrong; `None` = the payload is too short.
     pub fn counter(&self, payload: &[u8]) -> Option<u8> {
         match self.profile {
             Profile::P01A | Profile::P01C => payload.get(1).map(|byte| byte & 0x0F),
@@ -180,19 +174,17 @@ impl Protection {
         }
     }
 
-    /// Low nibble of the identifier's high byte, which variant 1C sends.
+    /// The nibble of the identifier that variant 1C sends.
     const fn id_nibble(&self) -> u8 {
         self.data_id.to_be_bytes()[0] & 0x0F
     }
 
-    /// CRC of profile 1, over everything except the CRC itself.
     fn crc8(&self, payload: &[u8]) -> u8 {
         let [high, low] = self.data_id.to_be_bytes();
         let second = if self.profile == Profile::P01C { 0 } else { high };
         crc8(crc8(0, &[low, second]), &payload[1..])
     }
 
-    /// CRC of profile 5, over everything except the CRC itself.
     fn crc16(&self, payload: &[u8]) -> u16 {
         crc16(crc16(0xFFFF, &payload[2..]), &self.data_id.to_le_bytes())
     }
@@ -217,7 +209,7 @@ static CRC8: [u16; 256] = crc_table(8, 0x1D);
 static CRC16: [u16; 256] = crc_table(16, 0x1021);
 
 fn crc8(start: u8, bytes: &[u8]) -> u8 {
-    // An eight-bit register is the lowest byte of a table entry.
+    // The CRC has eight bits: the lowest byte of a table entry.
     bytes.iter().fold(start, |crc, byte| CRC8[usize::from(crc ^ byte)].to_le_bytes()[0])
 }
 

@@ -1,11 +1,10 @@
-//! Limits the frame rate per identifier, so that one faulty sender does not use up the processing time that other
-//! messages need.
+//! Limits the frame rate per identifier, so that one faulty sender does not use up the processing time of other
+//! messages.
 //!
 //! In: time and identifier of each received frame. Out: whether the frame is admitted. Dropped frames are counted, and
-//! a [`FloodChange`] reports when dropping starts and ends. Each message has a leaky bucket, stored as one number: the
-//! time up to which the allowed rate is spent. In one burst, a bucket admits as many frames as the allowed rate permits
-//! in a tenth of a second, or two frames per multiplexer page if this is more. In the long run, it admits the allowed
-//! rate. The result depends only on the time stamps, and nothing is allocated after the start. Messages that are not
+//! a [`FloodChange`] reports when dropping starts and ends. Each message has a leaky bucket, stored as the time up to
+//! which the allowed rate is spent. A burst may have as many frames as the allowed rate permits in a tenth of a second,
+//! or two frames per multiplexer page if this is more. Nothing is allocated after the start. Messages that are not
 //! configured always pass, because they are not decoded and cost almost no time.
 
 use std::num::NonZeroU32;
@@ -19,14 +18,13 @@ use crate::quantity::{BusIndex, Timestamp};
 /// Allowed rate of one identifier.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct FloodConfig {
-    /// Frames per second on one interface.
+    /// Per interface.
     pub max_frames_per_s: NonZeroU32,
 }
 
 impl Default for FloodConfig {
-    /// 2,000 frames a second. The fastest intended sender has half this rate: no battery message is sent more often
-    /// than once a millisecond. A faulty sender can reach twice this rate: a saturated bus of 500 kbit/s carries about
-    /// 4,000 frames a second.
+    /// 2,000 frames a second, twice the rate of the fastest intended sender: no battery message is sent more often than
+    /// once a millisecond. A faulty sender can reach 4,000 frames a second, which saturates a bus of 500 kbit/s.
     fn default() -> Self {
         Self { max_frames_per_s: const { NonZeroU32::new(2000).unwrap() } }
     }
@@ -37,9 +35,8 @@ impl Default for FloodConfig {
 pub struct FloodChange {
     pub bus: BusIndex,
     pub id: CanId,
-    /// Whether dropping started.
     pub active: bool,
-    /// Number of frames dropped in this flood: 1 at the start, the total at the end.
+    /// 1 at the start, the total at the end.
     pub dropped: u64,
 }
 
@@ -52,7 +49,7 @@ pub struct FloodCount {
     pub dropped: u64,
 }
 
-/// Spent budget and present flood of one message, for a snapshot from which the monitor resumes without a gap.
+/// Spent budget and current flood of one message, from which the monitor resumes without a gap.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct FloodProgress {
     bus: BusIndex,
@@ -65,12 +62,11 @@ pub struct FloodProgress {
 struct LeakyBucket {
     bus: BusIndex,
     id: CanId,
-    /// Time (ns) that the frames of the largest admitted burst take at the allowed rate.
+    /// Time (ns) of the largest burst at the allowed rate.
     burst_ns: i64,
-    /// Time up to which the allowed rate is spent.
     spent_until: Option<Timestamp>,
     dropped: u64,
-    /// The flood in progress: number of dropped frames, and time of the last dropped frame.
+    /// Number of dropped frames, and time of the last dropped frame.
     flood: Option<(u64, Timestamp)>,
 }
 
@@ -81,20 +77,17 @@ pub struct FloodGate {
     frame_ns: i64,
     /// Sorted by interface and identifier.
     buckets: Vec<LeakyBucket>,
-    /// Maps messages to bucket indices.
     numbers: IdTable,
-    /// Changes to be published, in order.
     pub(crate) changes: Vec<FloodChange>,
 }
 
 impl FloodGate {
-    /// Creates a gate for messages, each with its number of pages. A multiplexed message may send each of its pages
-    /// twice at once.
+    /// Creates a gate for messages, given with their numbers of pages.
     pub fn new(config: &FloodConfig, messages: impl IntoIterator<Item = (BusIndex, CanId, usize)>) -> Self {
         let frame_ns = (1_000_000_000 / i64::from(config.max_frames_per_s.get())).max(1);
         let bucket = |(bus, id, pages): (BusIndex, CanId, usize)| {
             let pages_ns = i64::try_from(2 * pages).unwrap_or(i64::MAX).saturating_mul(frame_ns);
-            // At the allowed rate, the frames of an admitted burst take at least a tenth of a second, ns.
+            // A burst takes at least a tenth of a second at the allowed rate, in ns.
             let burst_ns = 100_000_000.max(pages_ns).max(frame_ns);
             LeakyBucket { bus, id, burst_ns, spent_until: None, dropped: 0, flood: None }
         };
@@ -105,7 +98,7 @@ impl FloodGate {
         Self { frame_ns, numbers, changes: Vec::with_capacity(buckets.len() + 1), buckets }
     }
 
-    /// Inherits counts, spent budgets and floods from `old` for the messages that are in both gates.
+    /// Inherits the state of the messages that are in both gates.
     #[must_use]
     pub fn inheriting(mut self, old: &Self) -> Self {
         for bucket in &mut self.buckets {
@@ -116,7 +109,7 @@ impl FloodGate {
         self
     }
 
-    /// Whether a frame is admitted. `now` must never go back, except after [`Self::restart`].
+    /// Whether a frame is admitted. `now` must not go back, except after [`Self::restart`].
     #[inline]
     pub fn admit(&mut self, now: Timestamp, bus: BusIndex, id: CanId) -> bool {
         let Some(bucket) = self.buckets.get_mut(self.numbers.number(bus, id)) else { return true };
@@ -136,23 +129,22 @@ impl FloodGate {
 
     /// Ends each flood in which no frame was dropped for a second.
     pub fn poll(&mut self, now: Timestamp) {
-        // Shorter pauses belong to the same flood.
         self.end(|last| now.since(last) >= 1.0);
     }
 
-    /// Restores the whole budget and ends every flood. Called after sleep or a clock step.
+    /// Restores the whole budget and ends every flood.
     pub fn restart(&mut self) {
         self.end(|_| true);
         self.buckets.iter_mut().for_each(|bucket| bucket.spent_until = None);
     }
 
-    /// Messages with dropped frames, each with the number of dropped frames.
+    /// Messages with dropped frames.
     pub fn counts(&self) -> impl Iterator<Item = FloodCount> + '_ {
         let dropped = self.buckets.iter().filter(|bucket| bucket.dropped > 0);
         dropped.map(|bucket| FloodCount { bus: bucket.bus, id: bucket.id, dropped: bucket.dropped })
     }
 
-    /// Spent budgets and floods in progress.
+    /// Spent budgets and current floods.
     pub fn progress(&self) -> Vec<FloodProgress> {
         let is_used = |bucket: &&LeakyBucket| bucket.spent_until.is_some() || bucket.flood.is_some();
         let of = |bucket: &LeakyBucket| FloodProgress {
@@ -173,7 +165,7 @@ impl FloodGate {
         }
     }
 
-    /// Restores stored counts of messages that are still configured.
+    /// Restores stored counts.
     pub fn restore(&mut self, counts: &[FloodCount]) {
         for bucket in &mut self.buckets {
             let stored = counts.iter().find(|count| (count.bus, count.id) == (bucket.bus, bucket.id));
@@ -206,7 +198,7 @@ mod tests {
         FloodGate::new(&FloodConfig { max_frames_per_s }, [(BUS, ID, pages), (BUS, CanId::Standard(0x101), 1)])
     }
 
-    /// Sends `frames` frames at intervals of `gap_ns` from `from_ns` on; returns the number admitted.
+    /// Sends a frame every `gap_ns`. Returns the number of admitted frames.
     fn taken(gate: &mut FloodGate, from_ns: i64, gap_ns: i64, frames: i64) -> usize {
         let at = |n: i64| Timestamp::from_nanos(from_ns + n * gap_ns);
         (0..frames).filter(|&n| gate.admit(at(n), BUS, ID)).count()

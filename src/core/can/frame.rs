@@ -1,14 +1,14 @@
 //! A CAN frame without its socket: classic, FD or remote, with an identifier and up to 64 bytes.
 //!
-//! A constructor returns `None` for an identifier or length that no frame can have. Error frames are not represented:
-//! the drivers convert them to [`crate::monitor::BusEvent`].
+//! A constructor returns `None` for an identifier or length that no frame can have. The drivers convert error frames to
+//! [`crate::monitor::BusEvent`].
 
 use serde::{Deserialize, Serialize};
 
-/// Largest payload of a frame, bytes (CAN FD).
+/// Largest payload, bytes (CAN FD).
 pub const MAX_DATA: usize = 64;
 
-/// A CAN identifier. An 11-bit and a 29-bit identifier with the same number are different identifiers.
+/// A CAN identifier. An 11-bit and a 29-bit identifier with the same number are different.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 pub enum CanId {
     /// 11 bit, 0 to 0x7FF.
@@ -28,7 +28,7 @@ impl CanId {
         if id <= 0x1FFF_FFFF { Some(Self::Extended(id)) } else { None }
     }
 
-    /// The number of the identifier in a DBC, where bit 31 marks an extended identifier.
+    /// Number in a DBC, where bit 31 marks an extended identifier.
     pub const fn dbc_number(self) -> u32 {
         match self {
             Self::Standard(id) => id as u32,
@@ -36,7 +36,7 @@ impl CanId {
         }
     }
 
-    /// The number without the mark for extended identifiers.
+    /// The number without bit 31.
     pub const fn raw(self) -> u32 {
         match self {
             Self::Standard(id) => id as u32,
@@ -46,7 +46,7 @@ impl CanId {
 }
 
 impl std::fmt::Display for CanId {
-    /// Hexadecimal like candump: 3 digits for standard, 8 for extended identifiers.
+    /// Hexadecimal, 3 or 8 digits, like candump.
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             Self::Standard(id) => write!(f, "{id:03X}"),
@@ -55,7 +55,7 @@ impl std::fmt::Display for CanId {
     }
 }
 
-/// Whether a frame, classic or FD, can have exactly this length, bytes.
+/// Whether a classic or FD frame can have this length, bytes.
 pub(crate) const fn is_frame_length(len: usize) -> bool {
     matches!(len, 0..=8 | 12 | 16 | 20 | 24 | 32 | 48 | 64)
 }
@@ -63,11 +63,11 @@ pub(crate) const fn is_frame_length(len: usize) -> bool {
 /// Kind of a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub enum FrameKind {
-    /// Classic data frame, at most 8 bytes.
+    /// At most 8 bytes.
     Classic,
-    /// Classic remote request, without data. Its length is the requested length.
+    /// Has no data. Its length is the requested length.
     Remote,
-    /// CAN FD data frame, at most 64 bytes.
+    /// At most 64 bytes.
     Fd {
         /// Bit rate switch.
         brs: bool,
@@ -76,8 +76,8 @@ pub enum FrameKind {
     },
 }
 
-/// Payload bytes, followed by zeros. The alignment makes decoding faster: if a word is loaded soon after the frame was
-/// copied, a single store has written the whole word. A load that spans two stores must wait for both stores.
+/// Payload, followed by zeros. The alignment makes decoding faster, because copying then writes each word with a single
+/// store. A load that spans two recent stores must wait for both.
 #[derive(Clone, Copy, PartialEq, Eq, Hash)]
 #[repr(align(8))]
 struct Data([u8; MAX_DATA]);
@@ -102,7 +102,7 @@ impl Frame {
         is_frame_length(data.len()).then(|| Self::build(id, FrameKind::Fd { brs, esi }, data))
     }
 
-    /// An FD frame with at least `len` bytes, rounded up to an FD length; `None` above 64.
+    /// An FD frame with `len` rounded up to an FD length; `None` above 64.
     pub fn fd_padded(id: CanId, brs: bool, esi: bool, len: usize, payload: &[u8; MAX_DATA]) -> Option<Self> {
         let len = (len..=MAX_DATA).find(|len| is_frame_length(*len))?;
         Self::fd(id, brs, esi, &payload[..len])
@@ -118,8 +118,7 @@ impl Frame {
         (len <= 8).then_some(Self { id, kind: FrameKind::Remote, len, data: Data([0; MAX_DATA]) })
     }
 
-    /// A classic data frame whose payload is the lowest `len` (at most 8) bytes of `word`; the bytes above must be
-    /// zero.
+    /// A classic data frame with the lowest `len` (at most 8) bytes of `word`. The other bytes must be zero.
     #[inline]
     pub fn of_word(id: CanId, word: u64, len: u8) -> Self {
         debug_assert!(len <= 8 && (len == 8 || word >> (8 * len) == 0), "bytes beyond the payload must be zero");
@@ -180,7 +179,7 @@ impl Frame {
         self.len as usize
     }
 
-    /// Whether the frame carries no payload bytes.
+    /// Whether the payload is empty.
     pub fn is_empty(&self) -> bool {
         self.data().is_empty()
     }

@@ -1,19 +1,18 @@
 //! Checks the end-to-end protection of input messages.
 //!
-//! In: frames with their time and interface, in order of arrival; between frames, the time ([`Guards::poll`]). Out: the
-//! [`Status`] of each frame and counts per message. A [`GuardChange`] reports that a message starts to fail its check
-//! or becomes usable again.
+//! In: frames with their time and interface, in order of arrival, and the time between frames ([`Guards::poll`]). Out:
+//! the [`Status`] of each frame and counts per message. A [`GuardChange`] reports that a message starts to fail its
+//! check or becomes usable again.
 //!
 //! If a message's cycle time is known, each period without a frame counts as one [`Status::NoNewData`]. The first
-//! missing frame is counted one and a half periods after the last frame; the half period allows for jitter. Each
-//! further period counts one more. As long as the check allows as many lost frames as are missing, no change is
-//! reported, because the next frame will be usable. Otherwise, a sender with jitter would fill the log.
+//! missing frame is counted after one and a half periods, to allow for jitter. While no more frames are missing than
+//! the check allows, no change is reported, because the next frame will be usable. Otherwise, a sender with jitter
+//! would fill the log.
 //!
-//! A time without listening is not the sender's fault. After sleep, a restart of the program or a clock step, the
-//! receivers wait for a first frame again ([`Guards::restart`]). For the same reason, a restarted program restores the
-//! counts but not the frame counters. The sender has continued to send, so a stored frame counter would reject good
-//! frames, or accept an old frame that fits by chance. Only a state that resumes without a gap restores the counts and
-//! the frame counters ([`Guards::resume`]).
+//! After sleep, a restart of the program or a clock step, missing frames are not the sender's fault. The receivers then
+//! wait for a first frame again ([`Guards::restart`]). A restarted program restores the counts but not the frame
+//! counters. The sender has continued to send, so a stored counter would reject good frames, or accept an old frame by
+//! chance. Only a state that resumes without a gap restores the frame counters ([`Guards::resume`]).
 
 use serde::{Deserialize, Serialize};
 
@@ -21,8 +20,7 @@ use crate::can::e2e::{CheckConfig, Receiver, Status, StatusCounts};
 use crate::can::{CanId, Frame, FrameKind};
 use crate::quantity::{BusIndex, Timestamp};
 
-/// If no frame arrives within this number of periods after the last frame, a frame counts as missed. Each further
-/// period counts one more frame.
+/// After this number of periods without a frame, one frame counts as missed. Each further period counts one more.
 const MISSED_AFTER_PERIODS: f64 = 1.5;
 
 /// Configuration of one protected message.
@@ -30,9 +28,8 @@ const MISSED_AFTER_PERIODS: f64 = 1.5;
 pub struct GuardConfig {
     pub bus: BusIndex,
     pub id: CanId,
-    /// Settings of the check.
     pub check: CheckConfig,
-    /// Period (s), above 0; `None` = unknown, so missing frames are not counted.
+    /// Above 0. `None` = unknown, so missing frames are not counted.
     pub cycle_time_s: Option<f64>,
 }
 
@@ -41,12 +38,9 @@ pub struct GuardConfig {
 pub struct GuardChange {
     pub bus: BusIndex,
     pub id: CanId,
-    /// The status that caused the change.
     pub status: Status,
-    /// Whether the message is usable now.
     pub usable: bool,
-    /// Number of failed checks since the message was last usable. When the message becomes usable again, this number is
-    /// the total.
+    /// Failed checks since the message was last usable.
     pub count: u64,
 }
 
@@ -56,11 +50,10 @@ pub struct GuardChange {
 pub struct GuardCounts {
     pub bus: BusIndex,
     pub id: CanId,
-    /// Number of checks by status.
     pub counts: StatusCounts,
 }
 
-/// Progress of one message's check, for a snapshot from which the monitor resumes without a gap.
+/// Progress of one message's check, from which the monitor resumes without a gap.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct GuardProgress {
     bus: BusIndex,
@@ -75,11 +68,11 @@ pub struct GuardProgress {
 struct Guard {
     config: GuardConfig,
     receiver: Receiver,
-    /// When the next frame counts as missed; `None` = the cycle time is unknown, or listening has not started.
+    /// When the next frame counts as missed.
     missed_at: Option<Timestamp>,
     /// Consecutive periods without a frame.
     missed: u64,
-    /// Number of failed checks since the last usable frame; 0 = no failure has been reported since then.
+    /// Failed checks since the last usable frame; 0 = no failure was reported.
     failed: u64,
 }
 
@@ -88,24 +81,22 @@ struct Guard {
 pub struct Guards {
     /// Sorted by interface and identifier.
     guards: Vec<Guard>,
-    /// Changes to be published, in order.
     pub(crate) changes: Vec<GuardChange>,
 }
 
 impl Guards {
-    /// Creates guards for messages. If several entries are for the same message, the first entry is used.
+    /// Creates guards. Of several entries for one message, the first is used.
     pub fn new(mut configs: Vec<GuardConfig>) -> Self {
         configs.sort_by_key(|config| (config.bus, config.id));
         configs.dedup_by_key(|config| (config.bus, config.id));
         let guard = |config| Guard { config, receiver: Receiver::default(), missed_at: None, missed: 0, failed: 0 };
-        // A check adds at most two changes (frames were missing, the message is usable again), and a poll adds at most
-        // one change per message. Therefore nothing is allocated later.
+        // The capacity suffices, because a check adds at most two changes and a poll adds at most one change per
+        // message.
         Self { changes: Vec::with_capacity(configs.len() + 1), guards: configs.into_iter().map(guard).collect() }
     }
 
-    /// Inherits the counts from `old` for the messages that are in both `self` and `old`. If the configuration of a
-    /// message has not changed, also inherits the message's receiver. With a new receiver, the next frame would be a
-    /// first frame, which is not used.
+    /// Inherits the counts of messages that are also in `old`. Also inherits the receivers of unchanged messages,
+    /// because a new receiver would not use its first frame.
     #[must_use]
     pub fn inheriting(mut self, old: &Self) -> Self {
         for guard in &mut self.guards {
@@ -119,7 +110,7 @@ impl Guards {
         self
     }
 
-    /// Checks a frame; `None` = the message is not protected, or the frame is a remote request, which carries no data.
+    /// Checks a frame; `None` = the message is not protected, or the frame is a remote request.
     #[inline]
     pub fn check(&mut self, now: Timestamp, bus: BusIndex, frame: &Frame) -> Option<Status> {
         if self.guards.is_empty() || frame.kind() == FrameKind::Remote {
@@ -140,8 +131,7 @@ impl Guards {
         Some(status)
     }
 
-    /// Counter that the next frame of a protected message must have; `None` = the message is not protected, or any
-    /// counter is valid.
+    /// Counter that the next frame must have; `None` = any counter.
     pub fn next_counter(&self, bus: BusIndex, id: CanId) -> Option<u8> {
         let found = self.guards.binary_search_by_key(&(bus, id), |guard| (guard.config.bus, guard.config.id)).ok()?;
         let guard = &self.guards[found];
@@ -153,8 +143,7 @@ impl Guards {
         self.guards.iter_mut().for_each(|guard| guard.count_missed(now, &mut self.changes));
     }
 
-    /// Lets every receiver wait for a first frame again. Keeps the counts. Called after a time without listening or a
-    /// clock step.
+    /// Makes every receiver wait for a first frame again. Keeps the counts.
     pub fn restart(&mut self) {
         for guard in &mut self.guards {
             guard.receiver.restart();
@@ -184,7 +173,7 @@ impl Guards {
         self.guards.iter().map(of).collect()
     }
 
-    /// Resumes the stored progress of each check. The caller restores the counts first.
+    /// Resumes stored progress. The caller restores the counts first.
     pub fn resume(&mut self, stored: &[GuardProgress]) {
         for guard in &mut self.guards {
             let key = (guard.config.bus, guard.config.id);
@@ -195,7 +184,7 @@ impl Guards {
         }
     }
 
-    /// Restores stored counts and restarts the receivers. Ignores counts of messages that are no longer protected.
+    /// Restores stored counts and restarts the receivers.
     pub fn restore(&mut self, state: &[GuardCounts]) {
         self.restart();
         for guard in &mut self.guards {
@@ -208,15 +197,14 @@ impl Guards {
 }
 
 impl Guard {
-    /// Counts one [`Status::NoNewData`] for each period without a frame.
     fn count_missed(&mut self, now: Timestamp, changes: &mut Vec<GuardChange>) {
         let Some(period_s) = self.config.cycle_time_s else { return };
-        // At the start of listening, the first period begins now.
+        // When listening starts, the first period begins.
         let missed_at = *self.missed_at.get_or_insert(now.plus_secs(MISSED_AFTER_PERIODS * period_s));
         if now < missed_at {
             return;
         }
-        // At least one nanosecond, to avoid a division by 0.
+        // Avoids a division by 0.
         let period_ns = Timestamp::ZERO.plus_secs(period_s).nanos().max(1);
         let periods = now.nanos().saturating_sub(missed_at.nanos()) / period_ns + 1;
         self.missed_at = Some(missed_at.plus_nanos(periods.saturating_mul(period_ns)));
@@ -226,7 +214,7 @@ impl Guard {
         self.note(status, periods, changes);
     }
 
-    /// Records the status of one or more checks; adds a change if the message turns usable or failing.
+    /// Adds a change if the message becomes usable or starts to fail.
     fn note(&mut self, status: Status, checks: u64, changes: &mut Vec<GuardChange>) {
         let GuardConfig { bus, id, check, .. } = self.config;
         if status.is_usable() {
@@ -241,7 +229,7 @@ impl Guard {
             return;
         }
         self.failed = match status {
-            // A first frame is neither good nor bad.
+            // A first frame is neither a success nor a failure.
             Status::Initial => 0,
             Status::NoNewData if self.missed <= u64::from(check.max_delta_counter_init) => 0,
             Status::NoNewData => self.missed,

@@ -1,16 +1,15 @@
 //! Finds the index of a message by interface and identifier.
 //!
-//! A look-up needs one load for a standard identifier and a binary search for an extended one. For a message that is
-//! not in the table, the look-up returns an index beyond the table's end.
+//! A look-up needs one load for a standard identifier and a binary search for an extended identifier.
 
 use crate::can::CanId;
 use crate::quantity::BusIndex;
 
 const STANDARD_IDS: usize = 0x800;
-/// Marks an identifier without a message.
+/// No message.
 const NONE: u32 = u32::MAX;
 
-/// Maps an interface and an identifier to the message's index in the list that the table was created from.
+/// Maps interface and identifier to the message's index in the list that was passed to `new`.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub(crate) struct IdTable {
     buses: Vec<BusTable>,
@@ -18,10 +17,9 @@ pub(crate) struct IdTable {
 
 #[derive(Debug, Clone, PartialEq)]
 struct BusTable {
-    /// Index by standard identifier. The array has 8 KiB, but look-ups of configured messages touch few of its cache
-    /// lines.
+    /// Index by standard identifier. Of the 8 KiB, look-ups touch few cache lines.
     standard: Box<[u32; STANDARD_IDS]>,
-    /// Extended identifiers with their indices, sorted.
+    /// Sorted.
     others: Vec<(CanId, u32)>,
 }
 
@@ -32,8 +30,7 @@ impl BusTable {
 }
 
 impl IdTable {
-    /// Creates a table of messages. If several messages have the same interface and identifier, the table contains the
-    /// first of these messages.
+    /// If several messages have the same interface and identifier, the first is used.
     pub(crate) fn new(messages: impl IntoIterator<Item = (BusIndex, CanId)>) -> Self {
         let mut table = Self::default();
         for ((bus, id), number) in messages.into_iter().zip(0..NONE) {
@@ -45,7 +42,7 @@ impl IdTable {
         table
     }
 
-    /// Index of the message; `u32::MAX` or more if it is not in the table.
+    /// Index of the message; at least `u32::MAX` if the message is not in the table.
     #[inline]
     pub(crate) fn number(&self, bus: BusIndex, id: CanId) -> usize {
         let Some(ids) = self.buses.get(bus.index()) else { return usize::MAX };

@@ -2,13 +2,12 @@
 //! segments them.
 //!
 //! In: payloads of one sender's frames with their times. Out: complete messages, and the faults of lost messages.
-//! Supports normal and extended addressing, classic frames and, for reassembly, CAN FD (length escapes). A [`Receiver`]
-//! only listens, because the tester sends flow control. A receiver stores one message, and only the bytes that have
-//! arrived.
+//! Supports normal and extended addressing with classic frames. Reassembly also supports CAN FD (length escapes). A
+//! [`Receiver`] only listens, because the tester sends flow control. It stores only the bytes that have arrived.
 
 use crate::quantity::Timestamp;
 
-/// Longest time between two frames of one message, ns (N_Cr of ISO 15765-2, 1 s).
+/// Longest time between two frames of a message, ns (N_Cr of ISO 15765-2, 1 s).
 pub const FRAME_TIMEOUT_NS: i64 = 1_000_000_000;
 
 /// Longest message, bytes. Lengths above 4,095 use the escape of ISO 15765-2:2016.
@@ -23,27 +22,27 @@ const CLASSIC: usize = 8;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum IsoTpFault {
-    /// A consecutive frame does not have the next number: a frame is missing, duplicated or out of order.
+    /// A frame is missing, duplicated or out of order.
     WrongSequence,
-    /// The next consecutive frame did not arrive within a second.
+    /// The next frame did not arrive within a second.
     Timeout,
-    /// Another message started before the previous message ended, because there are two senders or the sender gave up.
+    /// Another message started too early: there are two senders, or the sender gave up.
     Overlap,
-    /// The requester refused the message by flow control (buffer overflow, reserved state).
+    /// Flow control refused the message (buffer overflow, reserved state).
     Refused,
-    /// The frame states an impossible length: 0, beyond the end of a single frame, or so small that the message needs
-    /// no first frame. A first frame that is not full also has this fault.
+    /// The length is 0, beyond the end of a single frame, or so small that no first frame is needed. Also used for a
+    /// first frame that is not full.
     WrongLength,
-    /// The message is longer than [`MAX_MESSAGE`].
+    /// Longer than [`MAX_MESSAGE`].
     TooLong,
-    /// A consecutive frame is too short: it must fill the length of the first frame or complete the message.
+    /// A consecutive frame is shorter than the first frame and does not complete the message.
     ShortFrame,
-    /// A consecutive frame arrived, but no message has started.
+    /// A consecutive frame without a message.
     NotBegun,
 }
 
 impl IsoTpFault {
-    /// Every fault, in the order of counts.
+    /// All faults, in the order of counts.
     pub const ALL: [Self; 8] = [
         Self::WrongSequence,
         Self::Timeout,
@@ -70,43 +69,41 @@ impl IsoTpFault {
     }
 }
 
-/// Outcome of a frame. Both fields may be set: a frame can interrupt one message and complete another.
+/// Outcome of a frame. A frame can interrupt one message and complete another.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Received {
-    /// A message was lost for this reason.
+    /// Why a message was lost.
     pub fault: Option<IsoTpFault>,
-    /// Effect of the frame on its own message.
+    /// Effect on the frame's own message.
     pub progress: Progress,
 }
 
 /// Effect of a frame on a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Progress {
-    /// No effect: the frame does not belong to a message, or belongs to a lost message.
+    /// The frame does not belong to a message, or its message was lost.
     #[default]
     None,
-    /// The frame started a message of several frames.
     Begun,
-    /// The frame continued a message.
     Continued,
-    /// The frame completed a message, see [`Receiver::message`].
+    /// [`Receiver::message`] returns the completed message.
     Complete,
 }
 
 /// Reassembles the messages of one sender.
 #[derive(Debug, Clone, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 pub struct Receiver {
-    /// First data byte of every frame, for extended addressing.
+    /// For extended addressing.
     extension: Option<u8>,
     message: Vec<u8>,
-    /// Length of the message being received; 0 = no message.
+    /// 0 = no message.
     length: usize,
-    /// Sequence number of the next consecutive frame, 0 to 15.
+    /// Next sequence number, 0 to 15.
     next: u8,
-    /// Payload length of the first frame (RX_DL), without the extension.
+    /// Length of the first frame (RX_DL), without the extension.
     frame_len: usize,
     latest: Timestamp,
-    /// Whether a message was lost and its further frames are ignored without another fault.
+    /// Whether the remaining frames of a lost message are ignored.
     is_discarding: bool,
 }
 
@@ -147,14 +144,14 @@ impl Receiver {
                 0x0 => self.single(data),
                 0x1 => self.first(now, data),
                 0x2 => self.consecutive(now, control & 0xF, &data[1..]),
-                _ => Received::default(), // flow control and reserved types are not part of a message
+                _ => Received::default(), // Flow control and reserved types do not belong to a message.
             },
             [] => Received::default(),
         };
         Received { fault: late.or(received.fault), ..received }
     }
 
-    /// Handles a flow control frame of the requester: a refusal ends the message being received.
+    /// Handles a flow control frame. A refusal ends the message that is being received.
     pub fn handle_flow_control(&mut self, extension: Option<u8>, payload: &[u8]) -> Option<IsoTpFault> {
         let control = *without_extension(extension, payload)?.first()?;
         let is_refusal = control >> 4 == 0x3 && !matches!(control & 0xF, 0 | 1);
@@ -167,7 +164,7 @@ impl Receiver {
         is_late.then(|| self.drop_message(IsoTpFault::Timeout))
     }
 
-    /// Forgets a partial message without a fault, because frames may have been missed.
+    /// Drops a partial message without a fault, because frames may have been missed.
     pub fn restart(&mut self) {
         (self.length, self.is_discarding) = (0, true);
     }
@@ -177,7 +174,7 @@ impl Receiver {
         fault
     }
 
-    /// Starts a message; returns the fault of the message that it interrupts.
+    /// Returns the fault of the message that is interrupted.
     fn begin(&mut self) -> Option<IsoTpFault> {
         let overlap = self.is_receiving().then_some(IsoTpFault::Overlap);
         (self.length, self.is_discarding) = (0, false);
@@ -186,7 +183,7 @@ impl Receiver {
 
     fn single(&mut self, data: &[u8]) -> Received {
         let overlap = self.begin();
-        // Frames with more than 8 bytes carry the length in the second byte.
+        // With more than 8 bytes, the length is in the second byte.
         let (length, body) = match (data[0] & 0xF, data) {
             (0, [_, length, body @ ..]) if body.len() + 2 > self.classic_len() => (usize::from(*length), body),
             (length, [_, body @ ..]) => (usize::from(length), body),
@@ -247,7 +244,7 @@ impl Receiver {
         Received { fault: None, progress: Progress::Complete }
     }
 
-    /// Payload length of a full classic frame, without the extension.
+    /// Without the extension.
     fn classic_len(&self) -> usize {
         CLASSIC - usize::from(self.extension.is_some())
     }
@@ -259,7 +256,7 @@ impl Received {
     }
 }
 
-/// The payload after the extension; `None` = the extension is missing or belongs to another address.
+/// `None` = the extension is missing or belongs to another address.
 fn without_extension(extension: Option<u8>, payload: &[u8]) -> Option<&[u8]> {
     match extension {
         None => Some(payload),
@@ -267,9 +264,8 @@ fn without_extension(extension: Option<u8>, payload: &[u8]) -> Option<&[u8]> {
     }
 }
 
-/// Segments a message into classic payloads: one single frame, or a first and consecutive frames. The payloads are
-/// padded with `padding` (ISO 15765-2 recommends 0xCC; cars also send 0x00, 0x55 and 0xAA). The result is empty for a
-/// message of 0 bytes or of more than 4,095.
+/// Segments a message into classic payloads, padded with `padding` (ISO 15765-2 recommends 0xCC; cars also send 0x00,
+/// 0x55 and 0xAA). The result is empty for a message of 0 bytes or of more than 4,095.
 pub fn segment(extension: Option<u8>, message: &[u8], padding: u8) -> Vec<[u8; CLASSIC]> {
     let room = CLASSIC - usize::from(extension.is_some());
     let Ok(length) = u16::try_from(message.len()) else { return Vec::new() };

@@ -1,9 +1,8 @@
 //! Decodes and encodes CAN frames, with layouts from DBC files, end-to-end protection, authentication, diagnostics over
 //! ISO-TP, and J1939.
 //!
-//! In: frames with interface and time. Out: readings in the program's units and signs, and frames. The module accepts
-//! any bytes: a reading that cannot be decoded has a fault instead of a value. The module is pure: it uses no socket,
-//! no file and no clock.
+//! In: frames with interface and time. Out: readings in the program's units and signs, and frames. Any bytes are
+//! accepted: if a signal cannot be decoded, its reading contains a fault instead of a value.
 
 pub mod dbc;
 pub mod decode;

@@ -1,8 +1,8 @@
 //! Detects other senders that use packwatch's own identifiers.
 //!
 //! In: sent frames, received frames. Out: an [`OwnIdChange`] at the first frame of another sender, and a second
-//! [`OwnIdChange`] after [`GONE_S`] without such a frame. A socket does not receive its own frames. However, an adapter
-//! or a recorded log may return them. Therefore each sent frame may return once, unchanged, within [`ECHO_S`].
+//! [`OwnIdChange`] after [`GONE_S`] without a frame of this sender. A socket does not receive its own frames, but an
+//! adapter or a recorded log may return them. Therefore, each sent frame may return once, unchanged, within [`ECHO_S`].
 
 use std::collections::VecDeque;
 
@@ -12,22 +12,21 @@ use crate::can::id_table::IdTable;
 use crate::can::{CanId, Frame};
 use crate::quantity::{BusIndex, Timestamp};
 
-/// Longest delay of an echo (a sent frame that returns) (s).
+/// Longest delay (s) of an echo (a sent frame that is received again).
 const ECHO_S: f64 = 1.0;
-/// Maximum number of stored sent frames: one second of status, health and alarm frames on two interfaces.
+/// Enough for one second of status, health and alarm frames on two interfaces.
 const MAX_SENT: usize = 128;
-/// Another sender is gone after this time without one of its frames (s).
+/// Without a frame for this time (s), another sender counts as gone.
 const GONE_S: f64 = 10.0;
 
 /// Reports that another sender started or stopped using packwatch's identifiers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct OwnIdChange {
     pub bus: BusIndex,
-    /// Identifier of the other sender's latest frame.
+    /// From the other sender's latest frame.
     pub id: CanId,
-    /// Whether the other sender started.
     pub active: bool,
-    /// Number of frames of the other sender: 1 when it started, the total when it stopped.
+    /// 1 when the sender started, the total when it stopped.
     pub frames: u64,
 }
 
@@ -42,7 +41,7 @@ pub struct OwnIdUse {
     frames: u64,
 }
 
-/// A sent frame, with a checksum instead of its payload, which is up to 64 bytes long.
+/// The checksum replaces the payload of up to 64 bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 struct SentFrame {
     time: Timestamp,
@@ -51,10 +50,8 @@ struct SentFrame {
     sum: u64,
 }
 
-/// Checksum of a payload and its length. It is FNV-1a with words of eight bytes instead of single bytes. This is
-/// faster, which matters because the checksum is computed for every sent frame. The checksum identifies copies and is
-/// not secure. Two different payloads of the same length never have the same checksum if the length is at most eight
-/// bytes.
+/// FNV-1a over words of eight bytes, which is faster than over single bytes. The checksum identifies copies and is not
+/// secure. Up to a length of eight bytes, different payloads of the same length have different checksums.
 fn sum(data: &[u8]) -> u64 {
     let start = 0xCBF2_9CE4_8422_2325 ^ data.len() as u64;
     data.chunks(8).fold(start, |sum, chunk| {
@@ -78,7 +75,6 @@ pub struct OwnFrames {
     numbers: IdTable,
     count: usize,
     state: OwnFramesState,
-    /// Changes to be published, in order.
     pub(crate) changes: Vec<OwnIdChange>,
 }
 
@@ -135,7 +131,7 @@ impl OwnFrames {
         }
     }
 
-    /// Detects senders that are gone.
+    /// Reports senders that are gone.
     pub fn poll(&mut self, now: Timestamp) {
         let changes = &mut self.changes;
         self.state.uses.retain(|other| {
@@ -147,19 +143,18 @@ impl OwnFrames {
         });
     }
 
-    /// Longest time that another sender has been present (s); 0 = no other sender.
+    /// Longest time (s) that another sender has been present; 0 = no other sender.
     pub fn longest_s(&self, now: Timestamp) -> f64 {
         // At least 1 ns, because 0 means that there is no other sender.
         self.state.uses.iter().map(|other| now.since(other.since).max(1e-9)).fold(0.0, f64::max)
     }
 
-    /// Interfaces with another sender, and the latest identifier used.
+    /// Interfaces with another sender, and the latest identifier that this sender used.
     pub fn uses(&self) -> impl Iterator<Item = (BusIndex, CanId)> + '_ {
         self.state.uses.iter().map(|other| (other.bus, other.id))
     }
 
-    /// Reports that every other sender has stopped, and forgets every expected echo. Called after a time without
-    /// listening or a clock step.
+    /// Reports every other sender as gone and discards the expected echoes.
     pub fn restart(&mut self) {
         self.poll(Timestamp::from_nanos(i64::MAX));
         self.state.uses.clear();

@@ -1,12 +1,12 @@
 //! Sends diagnostic requests to controllers, and stops when they could disturb the vehicle or another tester.
 //!
 //! In: frames, responses, the state of the car, the supply voltage and the time. Out: request and flow control frames,
-//! and a [`PollChange`] each time polling stops or starts, or a controller permanently rejects a request. At most one
+//! and a [`PollChange`] when polling stops or starts, or when a controller permanently rejects a request. At most one
 //! request is outstanding at a time. Polling stops while another tester is active, while the bus sleeps, while the
 //! supply voltage is low or unknown, and on standby.
 //!
-//! Only requests of a [`Service`](super::uds::Service) can be sent: the types cannot express a write, a session or a
-//! routine. The module is pure: it uses no clock and no socket.
+//! Only requests of a [`Service`](super::uds::Service) can be sent, because the types cannot express a write, a session
+//! or a routine. The module uses no clock and no socket.
 
 use serde::{Deserialize, Serialize};
 
@@ -15,10 +15,9 @@ use super::uds::{Controller, PENDING, Question, Refusal};
 use super::{CanId, Frame};
 use crate::quantity::{BusIndex, Timestamp};
 
-/// Pause of polling after another tester's request, ns. It is longer than the pause between the requests of a workshop
-/// tester.
+/// Pause after another tester's request, ns. A workshop tester sends its next request sooner.
 pub const FOREIGN_SILENCE_NS: i64 = 60_000_000_000;
-/// A bus is asleep after this time without a frame from other nodes, ns. The nodes of a running car send many frames a
+/// A bus without frames from other nodes for this time (ns) is asleep. The nodes of a running car send many frames a
 /// second.
 pub const ASLEEP_AFTER_NS: i64 = 2_000_000_000;
 /// Longest wait for the next frame of a response, ns. The standards allow 50 ms for the first frame (P2) and 1 s for
@@ -28,11 +27,9 @@ const ANSWER_WITHIN_NS: i64 = 1_000_000_000;
 /// State of the car, as derived from the pack current.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default, Serialize, Deserialize)]
 pub enum CarState {
-    /// The pack is being discharged.
     Drive,
-    /// The pack is being charged.
     Charge,
-    /// No current flows, or the current is unknown.
+    /// Also if the current is unknown.
     #[default]
     Parked,
 }
@@ -40,9 +37,8 @@ pub enum CarState {
 /// One request and how often it is sent.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PollRequest {
-    /// The value to request.
     pub question: Question,
-    /// Period in each [`CarState`], s; `None` = not sent in this state.
+    /// Period in each [`CarState`]; `None` = not sent in this state.
     pub every_s: [Option<f64>; 3],
     /// Whether the response contains the pack current.
     pub has_current: bool,
@@ -53,11 +49,11 @@ pub struct PollRequest {
 /// Configuration of polling.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PollConfig {
-    /// Requests. If several are due at the same time, the first of them in this list is sent first.
+    /// Of several due requests, the first in this list is sent first.
     pub requests: Vec<PollRequest>,
-    /// Maximum number of sent frames (requests and flow control) per second, over all requests.
+    /// Sent frames, including flow control.
     pub max_requests_per_s: f64,
-    /// Whether a supply voltage is configured. If so, nothing is sent without a good reading of the supply voltage.
+    /// Whether a supply voltage is configured. If so, nothing is sent without a good reading of this voltage.
     pub watches_supply: bool,
 }
 
@@ -65,13 +61,10 @@ pub struct PollConfig {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum PollSilence {
-    /// Stopped by command.
     Standby,
     /// Another tester sent a request less than a minute ago.
     OtherTester,
-    /// The supply voltage is low or unknown.
     LowSupply,
-    /// A polled bus is asleep: no frames from other nodes.
     BusAsleep,
 }
 
@@ -91,18 +84,17 @@ impl PollSilence {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "poll")]
 pub enum PollChange {
-    /// Polling stopped.
-    Silent { reason: PollSilence },
-    /// Polling started, for the first time or again.
+    Silent {
+        reason: PollSilence,
+    },
     Asking,
-    /// A controller rejected a request permanently; the request is never sent again.
+    /// A controller permanently rejected a request, which is not sent again.
     Refused {
-        /// The controller, by the identifier of its responses.
+        /// Identifier of the controller's responses.
         id: CanId,
         service: u8,
         /// Identifier of the requested value.
         identifier: u16,
-        /// Negative response code.
         code: u8,
     },
 }
@@ -110,9 +102,7 @@ pub enum PollChange {
 /// Outputs of the poller; the caller empties them.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct PollOutputs {
-    /// Frames to send, in this order.
     pub frames: Vec<(BusIndex, Frame)>,
-    /// Changes to report.
     pub changes: Vec<PollChange>,
 }
 
@@ -120,17 +110,16 @@ pub struct PollOutputs {
 struct Item {
     due: Timestamp,
     failures: u32,
-    /// Whether the request is never sent again.
+    /// Whether the request is not sent again.
     is_refused: bool,
 }
 
-/// The request whose response is outstanding.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 struct Outstanding {
     index: usize,
     sent: Timestamp,
     deadline: Timestamp,
-    /// Whether the response has received its flow control.
+    /// Whether flow control was sent.
     #[serde(default)]
     has_flow_control: bool,
 }
@@ -142,33 +131,31 @@ pub struct Poller {
     progress: PollProgress,
 }
 
-/// Progress of polling, for a snapshot from which the monitor resumes without a gap.
+/// Progress of polling, from which the monitor resumes without a gap.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct PollProgress {
     items: Vec<Item>,
     outstanding: Option<Outstanding>,
-    /// The request sent last.
     latest: Option<usize>,
-    /// When the rate limit allows the next request.
     rate_allows_at: Timestamp,
     state: CarState,
     is_standby: bool,
-    /// Time up to which the latest good supply reading is valid.
+    /// When the latest good supply reading expires.
     supply_good_until: Timestamp,
     foreign_until: Timestamp,
-    /// Time of the latest frame from other nodes on each polled bus.
+    /// Latest frame from other nodes on each polled bus.
     heard: Vec<(BusIndex, Timestamp)>,
     silence: Option<PollSilence>,
 }
 
 impl PollProgress {
-    /// Shifts the time that a restart needs to another clock.
+    /// Shifts the end of the silence after another tester.
     pub(crate) fn rebase(&mut self, by_nanos: i64) {
         self.foreign_until = self.foreign_until.plus_nanos(by_nanos);
     }
 
-    /// Drops everything that ends with the process. Returns `false` if nothing is left: neither standby nor the silence
-    /// after another tester.
+    /// Drops everything that ends with the process. Returns whether standby or the silence after another tester
+    /// remains.
     pub(crate) fn restart(&mut self, now: Timestamp) -> bool {
         (self.outstanding, self.latest, self.silence) = (None, None, None);
         self.items.clear();
@@ -182,7 +169,7 @@ impl PollProgress {
 }
 
 impl Poller {
-    /// Creates a poller that has received nothing yet and is therefore silent.
+    /// Creates a poller, which is silent until it receives frames.
     pub fn new(config: &PollConfig) -> Self {
         let item = Item { due: Timestamp::LONG_AGO, failures: 0, is_refused: false };
         let mut buses: Vec<BusIndex> = config.requests.iter().map(|request| request.question.controller.bus).collect();
@@ -210,8 +197,8 @@ impl Poller {
         &self.progress
     }
 
-    /// Restores standby and the silence after another tester, for example after a restart. The tester may have sent
-    /// further requests in the meantime, so its silence starts anew. `taken`: time of the stored progress.
+    /// Restores standby and the silence after another tester. This silence starts again, because the tester may have
+    /// sent further requests. `taken`: time of the stored progress.
     pub fn restore_silence(&mut self, stored: &PollProgress, taken: Timestamp, now: Timestamp) {
         self.progress.is_standby = stored.is_standby;
         if stored.hears_tester(taken) {
@@ -219,7 +206,7 @@ impl Poller {
         }
     }
 
-    /// Resumes stored progress, if it belongs to the same configuration.
+    /// Resumes stored progress of the same configuration.
     pub fn resume(&mut self, stored: &PollProgress) {
         let questions = self.progress.items.len();
         let exists = |index: usize| index < questions;
@@ -232,7 +219,7 @@ impl Poller {
         }
     }
 
-    /// Whether the poller sends requests on a bus. If so, it must receive every frame of that bus.
+    /// Whether the poller uses this bus and must receive all its frames.
     pub fn is_on(&self, bus: BusIndex) -> bool {
         self.progress.heard.iter().any(|(other, _)| *other == bus)
     }
@@ -242,7 +229,7 @@ impl Poller {
         self.progress.silence
     }
 
-    /// Number of requests that are never sent again.
+    /// Number of requests that are not sent again.
     pub fn refused(&self) -> usize {
         self.progress.items.iter().filter(|item| item.is_refused).count()
     }
@@ -254,15 +241,15 @@ impl Poller {
         }
         self.progress.state = state;
         for index in 0..self.progress.items.len() {
-            // A shorter period applies from now on, without waiting for the end of the longer period.
+            // A shorter period applies at once, before the longer period has ended.
             if let Some(period_s) = self.period_s(index) {
                 self.progress.items[index].due = self.progress.items[index].due.min(now.plus_secs(period_s));
             }
         }
     }
 
-    /// Handles a reading of the supply voltage: `good_until` is the time up to which the reading is valid; `None` = the
-    /// voltage is low or the reading is bad.
+    /// Handles a reading of the supply voltage. `good_until`: when the reading expires; `None` = the voltage is low or
+    /// the reading is bad.
     pub fn set_supply(&mut self, good_until: Option<Timestamp>) {
         self.progress.supply_good_until = good_until.unwrap_or(Timestamp::LONG_AGO);
     }
@@ -278,7 +265,7 @@ impl Poller {
         self.progress.heard.iter_mut().for_each(|(_, at)| *at = Timestamp::LONG_AGO);
     }
 
-    /// Handles a received frame of another node. Frames that the poller sent must not be passed.
+    /// Handles a frame of another node. The caller must not pass frames that the poller sent.
     pub fn handle_frame(&mut self, now: Timestamp, bus: BusIndex, frame: &Frame, out: &mut PollOutputs) {
         let Some(heard) = self.progress.heard.iter_mut().find(|(other, _)| *other == bus) else { return };
         let of_polled = |wanted: fn(&Controller) -> CanId| {
@@ -299,8 +286,8 @@ impl Poller {
         self.poll(now, out);
     }
 
-    /// Handles the first frame of a multi-frame response to the outstanding request: sends flow control, but only once
-    /// per request. A controller that sends further first frames gets no more answers; the listener counts their faults.
+    /// Handles the first frame of a multi-frame response. Sends flow control only once per request, so that a
+    /// controller that repeats first frames gets no further answer.
     pub fn handle_begun(&mut self, now: Timestamp, controller: &Controller, out: &mut PollOutputs) {
         let Some(question) = self.outstanding_of(controller) else { return };
         let is_first = |outstanding: &mut Outstanding| !std::mem::replace(&mut outstanding.has_flow_control, true);
@@ -342,11 +329,11 @@ impl Poller {
             return;
         };
         if code == PENDING {
-            // Longest wait after "response pending", ns (P2*).
+            // Longest wait after "response pending": 5 s (P2*), in ns.
             return self.extend_wait(now, 5_000_000_000);
         }
         let Some(Outstanding { index, .. }) = self.progress.outstanding.take() else { return };
-        // Permanent: service not supported, request out of range, security access denied.
+        // Permanent rejections: service not supported, request out of range, security access denied.
         if [0x11, 0x31, 0x33].contains(&code) {
             self.progress.items[index].is_refused = true;
             let (id, service) = (controller.response, question.service as u8);
@@ -385,8 +372,7 @@ impl Poller {
         }
     }
 
-    /// Time at which [`poll`](Self::poll) must be called next; `None` = not before a frame, a command or a reading
-    /// arrives.
+    /// Time of the next [`poll`](Self::poll); `None` = only after a frame, a command or a reading.
     pub fn next_due(&self) -> Option<Timestamp> {
         match self.progress.silence {
             Some(PollSilence::OtherTester) => return Some(self.progress.foreign_until),
@@ -402,7 +388,7 @@ impl Poller {
         asleep.into_iter().chain(supply).chain(request).min()
     }
 
-    /// Whether no frame has been heard on a polled bus lately.
+    /// Whether a polled bus is asleep.
     pub fn is_bus_asleep(&self, now: Timestamp) -> bool {
         let is_asleep = |(_, at): &(BusIndex, Timestamp)| now.nanos().saturating_sub(at.nanos()) >= ASLEEP_AFTER_NS;
         self.progress.heard.iter().any(is_asleep)
@@ -420,7 +406,7 @@ impl Poller {
         }
     }
 
-    /// The next request and its due time.
+    /// The next request: index and due time.
     fn next(&self) -> Option<(usize, Timestamp)> {
         let waiting = self
             .progress
@@ -431,7 +417,7 @@ impl Poller {
         waiting.map(|(index, item)| (index, item.due)).min_by_key(|(_, due)| *due)
     }
 
-    /// Shortest mean period of the sent frames, s.
+    /// Minimum average time between two sent frames, s.
     fn frame_period_s(&self) -> f64 {
         1.0 / self.config.max_requests_per_s
     }
@@ -440,9 +426,9 @@ impl Poller {
         self.config.requests[index].every_s[self.progress.state as usize]
     }
 
-    /// Index of the request to send now. If the response to request `index` contains voltages but not the current, the
-    /// request for the current is sent first, unless the request for the current was the last one sent, failed last
-    /// time or was refused.
+    /// Index of the request to send now. If the response to request `index` contains voltages but not the current, a
+    /// request for the current comes first. This does not apply if that request was the last one sent, failed the last
+    /// time or was rejected.
     fn with_current_before(&self, index: usize) -> usize {
         let wanted = &self.config.requests[index];
         if !wanted.has_voltages || wanted.has_current {
@@ -468,29 +454,29 @@ impl Poller {
         self.progress.outstanding = Some(Outstanding { index, sent: now, deadline, has_flow_control: false });
         self.progress.latest = Some(index);
         self.progress.rate_allows_at = now.plus_secs(self.frame_period_s());
-        // A request without a period in this state is sent only before a request for voltages.
+        // Without a period in this state, the request is sent only because it precedes a request for voltages.
         let period_s = self.period_s(index).unwrap_or(0.0);
         let item = &mut self.progress.items[index];
         let next = item.due.plus_secs(period_s);
-        // If the request is less than a period late, the next due time follows one period after the last due time.
+        // If the request is less than a period late, it keeps its cycle.
         item.due = if item.due <= now && next > now { next } else { now.plus_secs(period_s) };
     }
 
-    /// Extends the wait for the response, up to a limit.
+    /// Extends the wait up to a limit.
     fn extend_wait(&mut self, now: Timestamp, by_ns: i64) {
         if let Some(outstanding) = &mut self.progress.outstanding {
-            // Maximum total wait (ns), because a gateway may respond "pending" forever.
+            // At most 30 s (in ns) in total, because a gateway may respond "pending" forever.
             outstanding.deadline = now.plus_nanos(by_ns).min(outstanding.sent.plus_nanos(30_000_000_000));
         }
     }
 
-    /// Increases the pause after a failed request.
+    /// Delays a failed request. The pause doubles with each consecutive failure.
     fn fail(&mut self, now: Timestamp, index: usize) {
         let period_s = self.period_s(index).unwrap_or(1.0);
         let item = &mut self.progress.items[index];
         item.failures = item.failures.saturating_add(1);
         let pause_s = period_s * 2.0_f64.powi(item.failures.min(16).cast_signed());
-        // Longest pause after failures (s), unless the period is longer.
+        // At most 600 s, unless the period is longer.
         item.due = item.due.max(now.plus_secs(pause_s.clamp(period_s, period_s.max(600.0))));
     }
 
@@ -500,8 +486,8 @@ impl Poller {
     }
 }
 
-/// Whether only testers use this identifier: the request identifiers of ISO 15765-4 (physical or functional), and those
-/// of BMW (6F1), Volkswagen (710, 17FC00xx) and Renault-Nissan (743).
+/// Whether only testers use the identifier: requests of ISO 15765-4 (physical or functional), BMW (6F1), Volkswagen
+/// (710, 17FC00xx) and Renault-Nissan (743).
 fn is_tester(id: CanId) -> bool {
     match id {
         CanId::Standard(raw) => matches!(raw, 0x7DF..=0x7E7 | 0x6F1 | 0x710 | 0x743),

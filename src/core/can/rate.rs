@@ -1,17 +1,18 @@
 //! Detects a second sender of an unprotected input message by comparing the frame rate with the expected rate.
 //!
-//! In: the time and identifier of each frame, and the battery current that the frame reports; between frames, the time
-//! ([`SecondSenders::poll`]). Out: a [`SenderChange`] when a second sender is found, and when the second sender is
-//! gone.
+//! In: time and identifier of each frame, the battery current that the frame reports, and the time between frames
+//! ([`SecondSenders::poll`]). Out: a [`SenderChange`] when a second sender is found, and when this sender is gone.
 //!
-//! Frames are counted in windows of [`WINDOW_NS`]. A second sender is found if, in [`WINDOWS`] consecutive windows, the
-//! number of frames is above [`EXCESS`] times the expected number and one of two further signs appears. The first sign
-//! is that many intervals are much shorter than the mean, because each frame of one sender falls between two frames of
-//! the other sender. The second sign is that the reported currents alternate. A single sender that becomes faster, as
-//! many do when the vehicle wakes, shows neither sign. Some messages always have short intervals, for example between
-//! the pages of a multiplexed message. These intervals are learned with the rate and do not count. The expected number
-//! follows from the highest steady rate so far, or from the DBC's cycle time if the cycle time gives a higher rate. The
-//! learned rate is stored, so that a second sender is also found after a restart.
+//! Frames are counted in windows of [`WINDOW_NS`]. A window is suspicious if it has more than [`EXCESS`] times the
+//! expected number of frames and one of two further signs. The first sign is that many intervals are much shorter than
+//! the mean, because each frame of one sender falls between two frames of the other sender. The second sign is that the
+//! reported currents alternate. After [`WINDOWS`] consecutive suspicious windows, a second sender is found. A single
+//! sender that becomes faster, as many do when the vehicle wakes, shows neither sign. Some messages always have short
+//! intervals, for example between the pages of a multiplexed message. These intervals are learned with the rate and do
+//! not count.
+//!
+//! The expected number follows from the highest steady rate so far, or from the DBC's cycle time if the latter gives a
+//! higher rate. The learned rate is stored, so that a second sender is also found after a restart.
 //!
 //! A second sender is not found in these cases:
 //! * the message has fewer than [`LEAST_PER_S`] frames a second, and the second sender is as slow as the first;
@@ -29,28 +30,26 @@ use crate::can::id_table::IdTable;
 use crate::quantity::{BusIndex, Timestamp};
 
 const WINDOW_NS: i64 = 1_000_000_000;
-/// A window is suspicious if the number of frames is above this multiple of the expected number and the window has a
-/// sign of a second sender ([`SIGNS`]). A second sender with the same cycle time doubles the number.
+/// A window may be suspicious above this multiple of the expected number of frames. A second sender with the same cycle
+/// time doubles the number.
 const EXCESS: f64 = 1.5;
-/// Number of additional frames that a normal window may have, because arbitration may have delayed them into the
-/// window.
+/// Additional frames of a normal window, because arbitration may delay frames into the window.
 const DELAYED: f64 = 1.5;
-/// A second sender is found after this number of consecutive suspicious windows. A burst after a pause of the bus
-/// affects only one window.
+/// A second sender is found after this number of suspicious windows. A burst after a pause of the bus affects only one
+/// window.
 const WINDOWS: u32 = 3;
-/// The second sender counts as gone after this number of consecutive normal windows.
+/// After this number of normal windows, the second sender counts as gone.
 const GONE_WINDOWS: u32 = 10;
-/// A rate counts as steady after this number of consecutive windows with a similar number of frames.
+/// A rate is steady after this number of windows with similar numbers of frames.
 const STEADY_WINDOWS: u32 = 20;
-/// Largest difference between two similar numbers of frames: a fraction of the number, plus a constant number of
-/// frames.
+/// Largest difference between similar numbers of frames: a fraction of the number, plus a number of frames.
 const STEADY: (f64, f64) = (0.2, 1.0);
-/// Lowest rate that is learned, frames a second. Fewer frames in a window are not significant.
+/// Lowest learned rate, frames a second. Fewer frames per window are not significant.
 const LEAST_PER_S: f64 = 3.0;
 /// An interval shorter than this fraction of the mean is short.
 const SHORT: f64 = 0.5;
-/// A window has a sign of a second sender if the number of unusual short intervals, or of alternating currents, is at
-/// least this multiple of the expected number of frames, and at least 1.
+/// Number of unusual short intervals, or of alternating currents, that is a sign of a second sender: this multiple of
+/// the expected number of frames, at least 1.
 const SIGNS: f64 = 0.4;
 /// Fraction of the frames that follow a short interval by chance, because other messages delay them.
 const CHANCE_SHORT: f64 = 0.02;
@@ -60,11 +59,9 @@ const CHANCE_SHORT: f64 = 0.02;
 pub struct SenderChange {
     pub bus: BusIndex,
     pub id: CanId,
-    /// Whether a second sender was found.
     pub active: bool,
     /// Frames in the latest second.
     pub frames_per_s: u32,
-    /// Expected frames per second.
     pub expected_per_s: f64,
 }
 
@@ -74,23 +71,23 @@ pub struct SenderChange {
 pub struct MessageRate {
     bus: BusIndex,
     id: CanId,
-    /// Highest steady rate, 1/s.
+    /// 1/s.
     learned_per_s: Option<f64>,
-    /// Fraction of the frames that usually follow a short interval.
+    /// Fraction of the frames after a short interval.
     usual_short: f64,
-    /// Smoothed rate (1/s), and the number of consecutive windows with this rate.
+    /// Smoothed rate (1/s). `steady` is the number of consecutive windows with this rate.
     candidate: f64,
     steady: u32,
-    /// Number of consecutive suspicious windows, and of consecutive normal windows.
+    /// Number of consecutive suspicious windows. `calm` is the number of consecutive normal windows.
     excess: u32,
     calm: u32,
-    /// Start of the window; `None` = no frame since listening started or since a pause.
+    /// Start of the window; `None` = no frame since the start of listening or since a pause.
     window_from: Option<Timestamp>,
     frames: u32,
     short: u32,
     contradictions: u32,
     latest: Timestamp,
-    /// The previous two currents of the message (A).
+    /// The previous two currents.
     currents_a: [Option<f64>; 2],
     is_doubtful: bool,
 }
@@ -100,17 +97,16 @@ pub struct MessageRate {
 pub struct SecondSenders {
     /// Sorted by interface and identifier.
     rates: Vec<MessageRate>,
-    /// Rate from the DBC's cycle time, 1/s.
+    /// From the DBC's cycle time, 1/s.
     configured_per_s: Vec<Option<f64>>,
     numbers: IdTable,
-    /// Earliest start of a window. No window ends before this time plus [`WINDOW_NS`].
+    /// Earliest start of a window.
     next_end: Option<Timestamp>,
-    /// Changes to be published, in order.
     pub(crate) changes: Vec<SenderChange>,
 }
 
 impl SecondSenders {
-    /// Creates the detector for messages, each with its cycle time (s) if known.
+    /// Creates the detector. Messages are given with their cycle times (s), if known.
     pub fn new(messages: impl IntoIterator<Item = (BusIndex, CanId, Option<f64>)>) -> Self {
         let mut messages: Vec<_> = messages.into_iter().collect();
         messages.sort_by_key(|(bus, id, _)| (*bus, *id));
@@ -147,7 +143,7 @@ impl SecondSenders {
         }
     }
 
-    /// Compares the battery current in a [counted](Self::handle) frame with the two currents before it. `step_a` is the
+    /// Compares the current in a [counted](Self::handle) frame with the two currents before it. `step_a` is the
     /// smallest step that exceeds noise (A).
     pub fn note_current(&mut self, bus: BusIndex, id: CanId, current_a: f64, step_a: f64) {
         let Some(rate) = self.rates.get_mut(self.numbers.number(bus, id)) else { return };
@@ -160,7 +156,7 @@ impl SecondSenders {
         rate.currents_a = [between, Some(current_a)];
     }
 
-    /// Ends the windows whose time has passed. A window without frames is a normal window.
+    /// Ends windows. A window without frames is a normal window.
     pub fn poll(&mut self, now: Timestamp) {
         let is_over = |from: Timestamp| now.nanos().saturating_sub(from.nanos()) >= WINDOW_NS;
         if !self.next_end.is_some_and(is_over) {
@@ -172,8 +168,8 @@ impl SecondSenders {
         self.next_end = self.rates.iter().filter_map(|rate| rate.window_from).min();
     }
 
-    /// Restarts counting after a time without listening or after a clock step. Keeps the learned rates. A second sender
-    /// that was found stays until enough normal windows have passed.
+    /// Restarts counting after a time without listening or a clock step. Keeps the learned rates and the second senders
+    /// that were found.
     pub fn restart(&mut self) {
         for rate in &mut self.rates {
             *rate = MessageRate {
@@ -186,13 +182,12 @@ impl SecondSenders {
         self.next_end = None;
     }
 
-    /// The statistics of each message, to store.
+    /// The statistics to store.
     pub fn snapshot(&self) -> Vec<MessageRate> {
         self.rates.clone()
     }
 
-    /// Restores stored statistics. If the program did not run between storing and restoring, call
-    /// [`restart`](Self::restart) afterwards.
+    /// Restores stored statistics. If the program did not run in between, call [`restart`](Self::restart) afterwards.
     pub fn restore(&mut self, stored: &[MessageRate]) {
         for of in stored.iter().filter(|of| of.is_possible()) {
             if let Some(rate) = self.rates.get_mut(self.numbers.number(of.bus, of.id)) {
@@ -234,7 +229,7 @@ impl MessageRate {
         if self.window_from.is_none() {
             self.window_from = Some(now);
         } else if self.candidate > 0.0 {
-            // Uses the mean rate up to the previous window, because the rate of the open window is not known yet.
+            // Use the mean rate, because the rate of the open window is not known yet.
             let interval_ns = now.nanos().saturating_sub(self.latest.nanos()) as f64;
             self.short = self.short.saturating_add(u32::from(interval_ns * self.candidate < SHORT * WINDOW_NS as f64));
         }
@@ -242,7 +237,6 @@ impl MessageRate {
         self.latest = now;
     }
 
-    /// Ends the open window if its time has passed.
     #[inline]
     fn end_windows(&mut self, now: Timestamp, configured: Option<f64>, changes: &mut Vec<SenderChange>) {
         let Some(from) = self.window_from else { return };
@@ -277,16 +271,15 @@ impl MessageRate {
         (self.frames, self.short, self.contradictions) = (0, 0, 0);
     }
 
-    /// Number of signs of a second sender in the window: short intervals or alternating currents, whichever are more.
-    /// Short intervals do not count until the rate of the message is learned. Then only those above the usual number
-    /// count.
+    /// Number of signs of a second sender: short intervals or alternating currents, whichever are more. Short intervals
+    /// count only after the rate is learned, and only above the usual number.
     fn signs(&self, frames: f64) -> f64 {
         let usual = frames * self.usual_short.max(CHANCE_SHORT);
         let short = self.learned_per_s.map_or(0.0, |_| f64::from(self.short) - usual);
         short.max(f64::from(self.contradictions))
     }
 
-    /// Learns a steady rate. A higher rate replaces a lower one, unless a second sender causes it.
+    /// Learns a steady rate. A higher rate replaces a lower rate, unless a second sender causes the higher rate.
     fn learn(&mut self, frames: f64, is_excess: bool) {
         let (part, count) = STEADY;
         let is_steady = (frames - self.candidate).abs() <= part * self.candidate + count;

@@ -1,5 +1,4 @@
-//! AUTOSAR secure on-board communication (SecOC): defines the layout of an authenticated payload and the input of its
-//! authenticator.
+//! AUTOSAR secure on-board communication (SecOC): layout of an authenticated payload and input of its authenticator.
 //!
 //! ```text
 //! data | low bits of the freshness | first bits of the authenticator      most significant bit first
@@ -20,8 +19,8 @@
 //! and width of the authenticated fields. The lengths of the profiles `fd` and `announcement` are packwatch's own.
 //!
 //! Deviation: AUTOSAR leaves the management of freshness to the manufacturer. Here, the receiver of commands announces
-//! the freshness that commands must carry ([`FreshnessWindow`]). The freshness of the other authenticated frames that
-//! packwatch sends increases by one with each frame.
+//! the freshness that commands must carry ([`FreshnessWindow`]). In all other authenticated frames that packwatch
+//! sends, the freshness increases by one with each frame.
 
 mod window;
 
@@ -31,25 +30,22 @@ use super::MAX_DATA;
 
 pub use window::{ANNOUNCEMENT_STEP, FreshnessWindow};
 
-/// Longest input of an authenticator, bytes: data id, payload, freshness.
+/// Bytes: data id, payload, freshness.
 const MAX_INPUT: usize = 2 + MAX_DATA + 8;
 
 /// A complete authenticator (AES-128-CMAC).
 pub type Mac = [u8; 16];
 
-/// Defines how many bits of the freshness and of the authenticator are sent.
+/// Defines how many bits of freshness and authenticator are sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub enum Profile {
-    /// AUTOSAR profile 1.
     #[serde(rename = "1")]
     P1,
-    /// AUTOSAR profile 3.
     #[serde(rename = "3")]
     P3,
-    /// Profile for CAN FD frames.
     #[serde(rename = "fd")]
     Fd,
-    /// Profile of the frame that announces the freshness of commands.
+    /// For the frame that announces the freshness of commands.
     #[serde(rename = "announcement")]
     Announcement,
 }
@@ -67,7 +63,7 @@ impl Profile {
         }
     }
 
-    /// Bits of the freshness that are sent.
+    /// Sent bits of the freshness.
     pub const fn freshness_bits(self) -> u32 {
         match self {
             Self::P1 => 8,
@@ -77,7 +73,7 @@ impl Profile {
         }
     }
 
-    /// Bits of the authenticator that are sent.
+    /// Sent bits of the authenticator.
     pub const fn mac_bits(self) -> u32 {
         match self {
             Self::P1 => 24,
@@ -86,18 +82,17 @@ impl Profile {
         }
     }
 
-    /// Number of bytes of freshness and authenticator at the end of the payload.
+    /// Bytes of freshness and authenticator at the end of the payload.
     pub const fn trailer_bytes(self) -> usize {
         ((self.freshness_bits() + self.mac_bits()) / 8) as usize
     }
 }
 
-/// Authentication of one message, as agreed between sender and receiver, without the key.
+/// Authentication of one message, without the key.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct Authentication {
-    /// Lengths of freshness and authenticator.
     pub profile: Profile,
-    /// Data identifier, unique among the messages of one key.
+    /// Unique among the messages of one key.
     pub data_id: u16,
 }
 
@@ -115,8 +110,7 @@ impl MacInput {
 }
 
 impl Authentication {
-    /// Input of the authenticator for this payload and freshness; `None` = the payload is shorter than the trailer, or
-    /// the data does not fit into a frame.
+    /// Input of the authenticator; `None` = the payload is too short or too long.
     pub fn mac_input(&self, payload: &[u8], freshness: u64) -> Option<MacInput> {
         let data = payload.get(..payload.len().checked_sub(self.profile.trailer_bytes())?)?;
         let mut input = MacInput { bytes: [0; MAX_INPUT], len: 0 };
@@ -127,18 +121,18 @@ impl Authentication {
         Some(input)
     }
 
-    /// The low bits of the freshness in a payload; `None` = the payload is too short.
+    /// Low bits of the freshness in a payload; `None` = the payload is too short.
     pub fn sent_freshness(&self, payload: &[u8]) -> Option<u64> {
         let trailer = self.trailer(payload)?;
         u64::try_from(trailer >> self.profile.mac_bits()).ok()
     }
 
-    /// Writes the low bits of a freshness, and zeros as the authenticator.
+    /// Writes the freshness, and zeros as the authenticator.
     pub fn write_freshness(&self, payload: &mut [u8], freshness: u64) {
         self.write_trailer(payload, u128::from(freshness & self.freshness_mask()) << self.profile.mac_bits());
     }
 
-    /// Writes the first bits of an authenticator after the freshness.
+    /// Writes the authenticator after the freshness.
     pub fn write_mac(&self, payload: &mut [u8], mac: Mac) {
         if let Some(trailer) = self.trailer(payload) {
             let bits = self.profile.mac_bits();
@@ -154,17 +148,15 @@ impl Authentication {
             .is_some_and(|trailer| std::hint::black_box(trailer & sent_bits ^ self.first_bits(mac)) == 0)
     }
 
-    /// Mask of the freshness bits that are sent.
     pub(super) const fn freshness_mask(&self) -> u64 {
         (1 << self.profile.freshness_bits()) - 1
     }
 
     const fn first_bits(&self, mac: Mac) -> u128 {
-        // 128 = bits of a complete authenticator.
+        // A complete authenticator has 128 bits.
         u128::from_be_bytes(mac) >> (128 - self.profile.mac_bits())
     }
 
-    /// The trailer of the payload as a number.
     fn trailer(&self, payload: &[u8]) -> Option<u128> {
         let start = payload.len().checked_sub(self.profile.trailer_bytes())?;
         Some(payload.get(start..)?.iter().fold(0, |number, byte| number << 8 | u128::from(*byte)))
@@ -178,11 +170,11 @@ impl Authentication {
     }
 }
 
-/// Maximum number of freshness values that one payload can represent. Two announcements cover 32 values, and profile 3
+/// Maximum number of freshness values that one payload can represent: two announcements cover 32 values, and profile 3
 /// sends 4 bits (16 codes).
 const MAX_CANDIDATES: usize = 2;
 
-/// The possible freshness values of a payload. With the payload and the key, they suffice to check its authenticator.
+/// The possible freshness values of a payload.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct MacCheck {
     authentication: Authentication,
@@ -190,8 +182,7 @@ pub struct MacCheck {
 }
 
 impl MacCheck {
-    /// The candidate that makes the authenticator of `payload` correct; `None` = no candidate does. `mac` computes
-    /// AES-128-CMAC.
+    /// The freshness with which the authenticator of `payload` is correct. `mac` computes AES-128-CMAC.
     pub fn verify(&self, payload: &[u8], mac: impl Fn(&[u8]) -> Mac) -> Option<u64> {
         let is_right = |freshness: &u64| {
             let input = self.authentication.mac_input(payload, *freshness);

@@ -1,13 +1,13 @@
 //! Decodes and encodes signals: numbers at a position of a payload.
 //!
 //! In: a layout from a DBC, and payload bytes. Out: raw codes (`u64`, the signal's bits, not sign-extended) and
-//! physical values (code x factor + offset, in the DBC's unit). A [`SignalPlan`] is a layout prepared once; decoding
-//! then needs one load, two shifts and one multiply-add. Signals have 1 to 64 bits at any position of a payload of up
-//! to 64 bytes.
+//! physical values (code x factor + offset, in the DBC's unit). A [`SignalPlan`] is a layout that was prepared once.
+//! Decoding then needs one load, two shifts and one multiply-add. Signals have 1 to 64 bits at any position of a
+//! payload of up to 64 bytes.
 //!
-//! Bad input gives a fault instead of a value. A payload that is too short gives [`Fault::ShortFrame`]. NaN or infinity
-//! gives [`Fault::NotFinite`]. A value outside the DBC's range gives [`Fault::OutOfRange`]. Encoding rounds to the
-//! nearest code and saturates.
+//! Bad input gives a fault instead of a value: [`Fault::ShortFrame`] for a payload that is too short,
+//! [`Fault::NotFinite`] for NaN or infinity, [`Fault::OutOfRange`] for a value outside the DBC's range. Encoding rounds
+//! to the nearest code and saturates.
 
 use crate::can::MAX_DATA;
 use crate::quantity::Fault;
@@ -18,9 +18,9 @@ const _: () = assert!(MAX_DATA * 8 == MAX_BITS as usize);
 /// Order of a signal's bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum ByteOrder {
-    /// Least significant byte first (`@1` in a DBC); the start bit is the least significant bit.
+    /// `@1` in a DBC. The start bit is the least significant bit.
     LittleEndian,
-    /// Most significant byte first (`@0`); the start bit is the most significant bit.
+    /// `@0` in a DBC. The start bit is the most significant bit.
     BigEndian,
 }
 
@@ -30,31 +30,27 @@ pub enum ValueType {
     Unsigned,
     /// Two's complement.
     Signed,
-    /// IEEE 754 single (`SIG_VALTYPE_ 1`), 32 bits.
+    /// `SIG_VALTYPE_ 1`.
     Float32,
-    /// IEEE 754 double (`SIG_VALTYPE_ 2`), 64 bits.
+    /// `SIG_VALTYPE_ 2`.
     Float64,
 }
 
 /// Position and conversion of a signal, as in a DBC.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SignalLayout {
-    /// Start bit in DBC numbering. Bits 0 to 7 are byte 0, from the least to the most significant bit; bit 8 starts
-    /// byte 1.
+    /// In DBC numbering: bits 0 to 7 are byte 0, from the least to the most significant bit.
     pub start_bit: u16,
-    /// Length, 1 to 64 bits.
+    /// 1 to 64.
     pub length_bits: u16,
-    /// Order of bytes.
     pub byte_order: ByteOrder,
-    /// Number format.
     pub value_type: ValueType,
     /// Physical units per code; not 0.
     pub factor: f64,
     /// Physical value of code 0.
     pub offset: f64,
-    /// Smallest physical value. If `minimum` and `maximum` are both 0, the range is not stated.
+    /// If `minimum` and `maximum` are both 0, the DBC states no range.
     pub minimum: f64,
-    /// Largest physical value.
     pub maximum: f64,
 }
 
@@ -68,9 +64,8 @@ pub struct LayoutFault(String);
 pub struct SignalPlan {
     /// First byte of the eight-byte window that is loaded.
     pub(crate) window: u8,
-    /// Number of bytes that the payload must have.
     bytes_needed: u8,
-    /// Whether the signal spans nine bytes, so that the window is widened to sixteen.
+    /// Whether the signal spans nine bytes.
     wide: bool,
     pub(crate) byte_order: ByteOrder,
     value_type: ValueType,
@@ -83,28 +78,27 @@ pub struct SignalPlan {
     /// Physical limits, widened by half a code so that rounding never rejects a code on the limit.
     pub(crate) low: f64,
     pub(crate) high: f64,
-    /// Smallest and largest code (sign-extended) that lies in the DBC's range and fits the bits.
+    /// Smallest and largest code in the DBC's range and in the signal's bits, sign-extended.
     low_code: i128,
     high_code: i128,
 }
 
-/// `code` as a float. It is exact up to 2^53; a larger code is rounded to the nearest float.
+/// `code` as a float: exact up to 2^53, otherwise rounded.
 pub(crate) fn float_of(code: u64) -> f64 {
     code as f64
 }
 
-/// `code` as a float. It is exact within +-2^53; a code outside is rounded to the nearest float.
+/// `code` as a float: exact within +-2^53, otherwise rounded.
 pub(crate) fn float_of_signed(code: i64) -> f64 {
     code as f64
 }
 
-/// Converts a float without fraction to an integer. Saturates at the ends of `i128`; NaN gives 0.
+/// Converts a float without fraction. Saturates; NaN gives 0.
 fn integer_of(whole: f64) -> i128 {
     whole as i128
 }
 
-/// Rounds to the nearest integer, half away from 0: like `number.round()`, but without a function call. Saturates at
-/// the ends of `i64`; NaN gives 0.
+/// Rounds like `number.round()`, but without a function call. Saturates; NaN gives 0.
 fn nearest(number: f64) -> i64 {
     let towards_zero = number as i64;
     // The difference is exact, because numbers above 2^52 have no fraction.
@@ -125,8 +119,8 @@ fn low_64(code: i128) -> u64 {
 }
 
 impl SignalLayout {
-    /// Positions of the first and last bit in wire order. Within a byte, little-endian signals count from bit 0 up, and
-    /// big-endian signals from bit 7 down.
+    /// First and last bit in wire order. Within a byte, little-endian signals count from bit 0 up, and big-endian
+    /// signals from bit 7 down.
     pub(crate) fn span(&self) -> (u32, u32) {
         let start = u32::from(self.start_bit);
         let first = match self.byte_order {
@@ -141,8 +135,7 @@ impl SignalLayout {
         self.span().1 / 8 + 1
     }
 
-    /// Smallest and largest physical value that the bits can represent, regardless of the stated range; infinite for
-    /// floats.
+    /// Physical range of the signal's bits; infinite for floats.
     pub fn extent(&self) -> (f64, f64) {
         if matches!(self.value_type, ValueType::Float32 | ValueType::Float64) || !(1..=64).contains(&self.length_bits) {
             return (f64::NEG_INFINITY, f64::INFINITY);
@@ -158,14 +151,13 @@ impl SignalLayout {
         self.bits().any(|bit| theirs.contains(&bit))
     }
 
-    /// The signal's bits in DBC numbering.
     fn bits(&self) -> impl Iterator<Item = u32> + use<> {
         let (first, last) = self.span();
         let is_little = self.byte_order == ByteOrder::LittleEndian;
         (first..=last).map(move |bit| if is_little { bit } else { bit - bit % 8 + (7 - bit % 8) })
     }
 
-    /// Whether minimum and maximum are stated; `[0|0]` means that they are not.
+    /// Whether the range is stated; `[0|0]` means that it is not.
     pub fn has_range(&self) -> bool {
         self.minimum != 0.0 || self.maximum != 0.0
     }
@@ -201,7 +193,7 @@ impl SignalLayout {
         }))
     }
 
-    /// Smallest and largest code that the bits can represent.
+    /// Smallest and largest code in the signal's bits.
     fn representable(&self) -> (i128, i128) {
         match self.value_type {
             ValueType::Signed => (-(1_i128 << (self.length_bits - 1)), (1_i128 << (self.length_bits - 1)) - 1),
@@ -209,8 +201,8 @@ impl SignalLayout {
         }
     }
 
-    /// Smallest and largest code that the bits can represent and that lies in the stated range. If no code lies in the
-    /// range, the range is ignored.
+    /// Smallest and largest code in the stated range and in the signal's bits. If no code lies in the range, the range
+    /// is ignored.
     fn code_limits(&self) -> (i128, i128) {
         /// Tolerance for the decimal numbers of the DBC, in codes.
         const ROUNDING: f64 = 1e-6;
@@ -228,7 +220,7 @@ impl SignalLayout {
     /// Physical limits, widened by half a code (for floats, by 1e-6 of the larger limit).
     fn physical_limits(&self) -> (f64, f64) {
         if !self.has_range() {
-            // Without a range, reject only values that factor and offset make infinite.
+            // Reject only values that factor and offset make infinite.
             return (f64::MIN, f64::MAX);
         }
         let room = match self.value_type {
@@ -238,10 +230,7 @@ impl SignalLayout {
         (self.minimum - room, self.maximum + room)
     }
 
-    /// Prepares the layout for decoding and encoding.
-    ///
-    /// # Errors
-    /// No payload can carry the signal, or factor, offset or range are invalid.
+    /// Prepares the layout for decoding and encoding, or says why it is invalid.
     pub fn plan(&self) -> Result<SignalPlan, LayoutFault> {
         self.check()?;
         let (first, last) = self.span();
@@ -257,7 +246,7 @@ impl SignalLayout {
         };
         let (low, high) = self.physical_limits();
         let (low_code, high_code) = self.code_limits();
-        // Each number is below 128, as checked above.
+        // Each number is below 128.
         let small = |n: u32| u8::try_from(n).unwrap_or(u8::MAX);
         Ok(SignalPlan {
             window: small(window),
@@ -289,13 +278,13 @@ impl SignalPlan {
         is_integer && !self.wide && self.down > 0
     }
 
-    /// Smallest and largest code that the bits of a simple signal can represent.
+    /// Smallest and largest code of a simple signal.
     pub(crate) fn codes(&self) -> (i64, i64) {
         let highest = (u64::MAX >> self.down).cast_signed();
         if self.value_type == ValueType::Signed { (-(highest >> 1) - 1, highest >> 1) } else { (0, highest) }
     }
 
-    /// Length of the signal in bits, 1 to 64.
+    /// Length, 1 to 64 bits.
     pub fn length_bits(&self) -> u32 {
         64 - u32::from(self.down)
     }
@@ -310,16 +299,13 @@ impl SignalPlan {
         u64::MAX >> self.down
     }
 
-    /// The signal's bits, lowest bit first, without sign extension.
-    ///
-    /// # Errors
-    /// [`Fault::ShortFrame`] if the payload ends before the signal does.
+    /// The signal's bits, without sign extension. Fails with [`Fault::ShortFrame`].
     #[inline]
     pub fn raw(&self, payload: &[u8]) -> Result<u64, Fault> {
         Ok(self.lifted(payload)? >> self.down)
     }
 
-    /// The signal's bits at the top of a word, with zeros or other payload bits below.
+    /// The signal's bits at the top of a word. The bits below may be other payload bits.
     #[inline]
     fn lifted(&self, payload: &[u8]) -> Result<u64, Fault> {
         if payload.len() < self.bytes_needed() {
@@ -349,14 +335,12 @@ impl SignalPlan {
             ByteOrder::BigEndian => u128::from_be_bytes(bytes),
         };
         let top = (word << self.up) >> 64;
-        // Lossless: 64 bits remain after the shift. The later shift by `down` drops the bits below the signal.
+        // Lossless, because 64 bits remain after the shift.
         u64::try_from(top).unwrap_or(u64::MAX)
     }
 
-    /// The physical value, in the DBC's unit, not checked against the DBC's range.
-    ///
-    /// # Errors
-    /// [`Fault::ShortFrame`], [`Fault::NotFinite`].
+    /// The physical value, not checked against the DBC's range. Fails with [`Fault::ShortFrame`] or
+    /// [`Fault::NotFinite`].
     #[inline]
     pub fn physical(&self, payload: &[u8]) -> Result<f64, Fault> {
         let lifted = self.lifted(payload)?;
@@ -376,18 +360,15 @@ impl SignalPlan {
         if number.is_finite() { Ok(number) } else { Err(Fault::NotFinite) }
     }
 
-    /// The physical value, in the DBC's unit, checked against the DBC's range (`[0|0]` means no range). A code on the
-    /// limit is in the range, regardless of rounding in factor and offset.
-    ///
-    /// # Errors
-    /// [`Fault::ShortFrame`], [`Fault::NotFinite`], [`Fault::OutOfRange`].
+    /// The physical value. Fails with [`Fault::ShortFrame`], [`Fault::NotFinite`] or, outside the DBC's range,
+    /// [`Fault::OutOfRange`]. A code on the limit is in the range, regardless of rounding.
     #[inline]
     pub fn decode(&self, payload: &[u8]) -> Result<f64, Fault> {
         let value = self.physical(payload)?;
         if value >= self.low && value <= self.high { Ok(value) } else { Err(Fault::OutOfRange) }
     }
 
-    /// The code nearest to a physical value, saturated at the limits of the bits and of the DBC's range; `None` for
+    /// The code nearest to a physical value. Saturates at the limits of the bits and of the DBC's range; `None` for
     /// NaN.
     pub fn code(&self, value: f64) -> Option<u64> {
         match self.value_type {
@@ -396,8 +377,8 @@ impl SignalPlan {
         }
     }
 
-    /// Like [`Self::code`], but saturates only at the limits of the bits. A value outside the DBC's range stays
-    /// outside, so that the receiver detects the fault.
+    /// Like [`Self::code`], but saturates only at the limits of the bits, so that the receiver detects values outside
+    /// the DBC's range.
     pub fn code_beyond_range(&self, value: f64) -> Option<u64> {
         let bits = self.length_bits();
         match self.value_type {
@@ -427,29 +408,22 @@ impl SignalPlan {
         match self.value_type {
             ValueType::Float32 => {
                 let number = number.clamp(f64::from(f32::MIN), f64::from(f32::MAX));
-                // Rounds to the nearest single-precision number; the clamp keeps it finite.
+                // The clamp keeps the number finite.
                 Some(u64::from((number as f32).to_bits()))
             }
             ValueType::Float64 | ValueType::Unsigned | ValueType::Signed => Some(number.to_bits()),
         }
     }
 
-    /// Encodes a physical value. Rounds to the nearest code. Saturates at the limits of the bits and of the DBC's
-    /// range, also for infinities. Other bits of the payload do not change.
-    ///
-    /// # Errors
-    /// [`Fault::ShortFrame`] if the payload ends before the signal does, [`Fault::NotFinite`] for NaN. The payload is
-    /// then unchanged.
+    /// Writes the nearest code. Saturates, also for infinities. Fails with [`Fault::ShortFrame`], or for NaN with
+    /// [`Fault::NotFinite`], and then leaves the payload unchanged.
     pub fn encode(&self, payload: &mut [u8], value: f64) -> Result<(), Fault> {
         let code = self.code(value).ok_or(Fault::NotFinite)?;
         self.encode_raw(payload, code)
     }
 
-    /// Writes the signal's bits.
-    ///
-    /// # Errors
-    /// [`Fault::ShortFrame`] if the payload ends before the signal does, [`Fault::OutOfRange`] if `code` has more bits
-    /// than the signal. The payload is then unchanged.
+    /// Writes the signal's bits. Fails with [`Fault::ShortFrame`], or with [`Fault::OutOfRange`] if `code` has more
+    /// bits than the signal, and then leaves the payload unchanged.
     pub fn encode_raw(&self, payload: &mut [u8], code: u64) -> Result<(), Fault> {
         if payload.len() < self.bytes_needed() {
             return Err(Fault::ShortFrame);
@@ -494,7 +468,7 @@ impl SignalPlan {
     }
 }
 
-/// `N` bytes of the payload from `from` on, padded with zeros.
+/// `N` bytes from `from` on, padded with zeros.
 fn padded<const N: usize>(payload: &[u8], from: usize) -> [u8; N] {
     let mut bytes = [0; N];
     for (to, byte) in bytes.iter_mut().zip(payload.iter().skip(from)) {

@@ -1,6 +1,6 @@
 //! Receives diagnostic responses over ISO-TP (UDS ISO 14229-1, KWP 2000, OBD ISO 15031-5) and decodes their signals.
 //!
-//! In: frames with the configured identifiers; the requests may come from any tester. Out: complete responses and their
+//! In: frames with the configured identifiers. Any tester may send the requests. Out: complete responses and their
 //! readings ([`Answer::readings`]), and counts per controller ([`ControllerCounts`]). This module sends nothing. It
 //! stores one message per configured controller.
 
@@ -21,16 +21,16 @@ pub const PENDING: u8 = 0x78;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 #[repr(u8)]
 pub enum Service {
-    /// Service 01 of OBD (live data), with an identifier of one byte.
+    /// Live data of OBD, with an identifier of one byte.
     CurrentData = 0x01,
-    /// `ReadDataByLocalIdentifier` of KWP 2000, with an identifier of one byte.
+    /// KWP 2000, with an identifier of one byte.
     ByLocalIdentifier = 0x21,
-    /// `ReadDataByIdentifier` of UDS, with an identifier of two bytes.
+    /// UDS, with an identifier of two bytes.
     ByIdentifier = 0x22,
 }
 
 impl Service {
-    /// The service with this code; `None` = any other service, which packwatch neither decodes nor requests.
+    /// The service with this code. `None` = another service, which packwatch neither decodes nor requests.
     pub fn from_code(code: u8) -> Option<Self> {
         [Self::CurrentData, Self::ByLocalIdentifier, Self::ByIdentifier].into_iter().find(|s| *s as u8 == code)
     }
@@ -48,13 +48,11 @@ impl Service {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub struct Controller {
     pub bus: BusIndex,
-    /// Identifier of the controller's responses.
     pub response: CanId,
-    /// First data byte of the responses, for extended addressing.
+    /// First data byte of the responses (extended addressing).
     pub response_extension: Option<u8>,
-    /// Identifier of requests to the controller.
     pub request: CanId,
-    /// First data byte of the requests, for extended addressing.
+    /// First data byte of the requests (extended addressing).
     pub request_extension: Option<u8>,
 }
 
@@ -73,7 +71,7 @@ impl Question {
         self.message(self.service as u8)
     }
 
-    /// The first bytes of the response: service and identifier.
+    /// First bytes of the response: service and identifier.
     pub fn answer_head(&self) -> Vec<u8> {
         self.message(self.service as u8 + POSITIVE)
     }
@@ -87,28 +85,26 @@ impl Question {
 /// A signal of a response.
 #[derive(Debug, Clone, PartialEq)]
 pub struct AnswerSignal {
-    /// Byte at which the layout starts, counted from 0 after the echoed service and identifier.
+    /// Byte at which the layout starts, after the echoed service and identifier.
     pub first_byte: usize,
-    /// The signal, with its layout relative to this byte, and with the interface and identifier of the response frames.
+    /// The signal, with the interface and identifier of the response frames.
     pub binding: Binding,
 }
 
 /// A response to be decoded.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Answer {
-    /// The request that the response answers.
     pub question: Question,
     pub signals: Vec<AnswerSignal>,
 }
 
 impl Answer {
-    /// Whether the response has a signal for a channel that satisfies the predicate.
+    /// Whether a signal's channel satisfies the predicate.
     pub fn has(&self, is_wanted: impl Fn(Channel) -> bool) -> bool {
         self.signals.iter().any(|signal| is_wanted(signal.binding.channel))
     }
 
-    /// Decodes the data of a response, which starts after the echoed service and identifier. A signal beyond the end of
-    /// a truncated response gives a short-frame fault.
+    /// Decodes the data after the echoed service and identifier. A signal beyond the end gives a short-frame fault.
     pub fn readings<'a>(&'a self, data: &'a [u8]) -> impl Iterator<Item = Reading> + 'a {
         self.signals.iter().map(move |signal| {
             let bytes = data.get(signal.first_byte..).ok_or(Fault::ShortFrame);
@@ -117,23 +113,22 @@ impl Answer {
     }
 }
 
-/// Number of messages from a controller, by kind.
+/// Number of a controller's messages by kind.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct ControllerCounts {
-    /// Complete responses that are decoded.
+    /// Decoded responses.
     pub read: u64,
-    /// Complete messages that are not decoded, because they have other identifiers or services.
+    /// Messages with other identifiers or services.
     pub other: u64,
-    /// Negative responses, except "response pending".
+    /// Negative responses without "response pending".
     pub refused: u64,
-    /// "Response pending" messages.
     pub pending: u64,
-    /// Code of the latest negative response, except "response pending".
+    /// Code of the latest negative response, without "response pending".
     pub latest_refusal: Option<u8>,
-    /// Decoded responses that do not answer the latest request, or that arrive more than five seconds after it. A
-    /// "response pending" restarts the five seconds.
+    /// Decoded responses that do not answer the latest request, or arrive more than five seconds after it or after
+    /// "response pending".
     pub unasked: u64,
-    /// Lost messages, indexed like [`IsoTpFault::ALL`].
+    /// Indexed like [`IsoTpFault::ALL`].
     pub lost: [u64; IsoTpFault::ALL.len()],
 }
 
@@ -152,7 +147,7 @@ impl ControllerCounts {
         }
     }
 
-    /// Faults that caused lost messages, each with the number of lost messages.
+    /// Faults with at least one lost message.
     pub fn losses(&self) -> impl Iterator<Item = (IsoTpFault, u64)> + '_ {
         IsoTpFault::ALL.into_iter().zip(self.lost).filter(|(_, count)| *count > 0)
     }
@@ -169,9 +164,9 @@ pub struct MessageLoss {
     pub bus: BusIndex,
     /// Identifier of the controller's responses.
     pub id: CanId,
-    /// The fault of the latest lost message.
+    /// Fault of the latest lost message.
     pub fault: IsoTpFault,
-    /// Number of messages lost so far.
+    /// Number of lost messages so far.
     pub lost: u64,
 }
 
@@ -180,40 +175,34 @@ pub struct MessageLoss {
 pub struct Refusal {
     /// The requested service.
     pub service: u8,
-    /// Negative response code (ISO 14229-1, table A.1); [`PENDING`] means that the response follows later.
+    /// ISO 14229-1, table A.1; [`PENDING`] = the response follows later.
     pub code: u8,
 }
 
-/// Result of a received frame.
+/// Result of a frame. `controller` is an index in [`Listener::counts`].
 #[derive(Debug, PartialEq)]
 pub enum FrameOutcome<'a> {
-    /// There is nothing to decode.
     Nothing,
-    /// The frame starts a response. The values of the response count as measured now.
+    /// The frame starts a response, whose values count as measured when this frame arrives.
     Begun {
-        /// Index of the controller in [`Listener::counts`].
         controller: usize,
     },
     /// The frame continues a response.
     Continued {
-        /// Index of the controller in [`Listener::counts`].
         controller: usize,
     },
     /// A negative response.
     Refused {
-        /// Index of the controller in [`Listener::counts`].
         controller: usize,
         refusal: Refusal,
     },
     /// A complete response.
     Whole {
-        /// Index of the controller in [`Listener::counts`].
         controller: usize,
-        /// Configuration of the response.
         answer: &'a Answer,
-        /// Data of the response, after the echoed service and identifier.
+        /// Data after the echoed service and identifier.
         data: &'a [u8],
-        /// Whether the response arrived in a single frame, without a preceding [`FrameOutcome::Begun`].
+        /// Whether the response is a single frame, without a preceding [`FrameOutcome::Begun`].
         is_single: bool,
     },
 }
@@ -223,13 +212,13 @@ struct Link {
     controller: Controller,
     receiver: Receiver,
     counts: ControllerCounts,
-    /// First bytes of the response to the latest request, and the time of that request or of the latest "response
+    /// First bytes of the response to the latest request, and the time of the request or of the latest "response
     /// pending".
     asked: Option<([u8; 3], Timestamp)>,
     reported_at: Option<Timestamp>,
 }
 
-/// Partial response of one controller, for a snapshot from which the monitor resumes without a gap.
+/// Partial response of one controller, from which the monitor resumes without a gap.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct LinkProgress {
     controller: Controller,
@@ -247,12 +236,11 @@ pub struct Listener {
     links: Vec<Link>,
     ids: IdTable,
     id_count: usize,
-    /// Losses to be reported.
     pub(crate) losses: Vec<MessageLoss>,
 }
 
 impl Listener {
-    /// Creates a listener for these responses. Responses to equal requests are merged.
+    /// Creates a listener. Responses to equal requests are merged.
     pub fn new(answers: &[Answer]) -> Self {
         let mut sorted: Vec<Answer> = Vec::new();
         for answer in answers {
@@ -263,7 +251,7 @@ impl Listener {
         }
         sorted.sort_by_key(|answer| answer.question);
         for answer in &mut sorted {
-            // Decode the current before the voltages, because the voltage samples use the current.
+            // Sort the current before the voltages, because the voltage samples use the current.
             answer.signals.sort_by_key(|signal| signal.binding.channel);
         }
         let mut controllers: Vec<Controller> = sorted.iter().map(|answer| answer.question.controller).collect();
@@ -325,7 +313,7 @@ impl Listener {
         }
     }
 
-    /// Forgets partial messages and requests. Called after a time without listening.
+    /// Drops partial messages and requests.
     pub fn restart(&mut self) {
         for link in &mut self.links {
             link.receiver.restart();
@@ -386,7 +374,7 @@ impl Listener {
         let Self { answers, links, .. } = self;
         let Some(link) = links.get_mut(controller) else { return FrameOutcome::Nothing };
         let message = link.receiver.message();
-        // 0x7F is the first byte of a negative response (ISO 14229-1, table A.1).
+        // Negative response (ISO 14229-1, table A.1).
         if let &[0x7F, service, code, ..] = message {
             if code == PENDING {
                 link.counts.pending = link.counts.pending.saturating_add(1);
@@ -407,7 +395,7 @@ impl Listener {
         let head = answer.question.answer_head();
         link.counts.read = link.counts.read.saturating_add(1);
         let is_asked = link.asked.is_some_and(|(asked, at)| {
-            // Longest time (ns) from request to response: the longest P2* of ISO 14229-2.
+            // In ns: the longest P2* of ISO 14229-2.
             asked.starts_with(&head) && now.nanos().saturating_sub(at.nanos()) <= 5_000_000_000
         });
         link.counts.unasked = link.counts.unasked.saturating_add(u64::from(!is_asked));
@@ -429,14 +417,14 @@ impl Link {
         self.receiver.handle_flow_control(extension, payload)
     }
 
-    /// Counts a loss; reports it unless a loss of this controller was reported within the last minute.
+    /// Counts a loss, and reports it at most once a minute.
     fn note(&mut self, now: Timestamp, fault: Option<IsoTpFault>, losses: &mut Vec<MessageLoss>) {
         let Some(fault) = fault else { return };
         let place = IsoTpFault::ALL.iter().position(|other| *other == fault);
         if let Some(count) = place.and_then(|place| self.counts.lost.get_mut(place)) {
             *count = count.saturating_add(1);
         }
-        // Shortest time between two reports for a controller, ns.
+        // A minute, in ns.
         if self.reported_at.is_none_or(|at| now.nanos().saturating_sub(at.nanos()) >= 60_000_000_000) {
             self.reported_at = Some(now);
             let Controller { bus, response: id, .. } = self.controller;
@@ -445,8 +433,8 @@ impl Link {
     }
 }
 
-/// Identifiers to be received for these responses. They include the identifiers of the requests, which show whether a
-/// response was requested.
+/// Identifiers to receive: those of the responses, and those of the requests, which show whether a response was
+/// requested.
 pub fn wanted(answers: &[Answer]) -> Vec<(BusIndex, CanId)> {
     let both = |answer: &Answer| {
         let Controller { bus, request, response, .. } = answer.question.controller;

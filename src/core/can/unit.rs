@@ -1,18 +1,18 @@
 //! Parses units as written in a DBC.
 //!
 //! In: the text between the quotation marks. Out: the quantity and the conversion to the program's unit (A, V, degrees
-//! C). The DBC format does not define a list of units, so an unknown unit gives no information.
+//! C). A DBC may contain any text as a unit, so an unknown unit is not an error.
 
 /// Quantity of a unit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Quantity {
-    /// Electric current; the program's unit is A.
+    /// In A.
     Current,
-    /// Voltage; the program's unit is V.
+    /// In V.
     Voltage,
-    /// Temperature; the program's unit is degrees C.
+    /// In degrees C.
     Temperature,
-    /// Any quantity that packwatch does not read. Contains its name with an article, such as `an angle`.
+    /// A quantity that packwatch does not read, with an article, such as `an angle`.
     Other(&'static str),
 }
 
@@ -25,15 +25,14 @@ impl Quantity {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SignalUnit {
     pub quantity: Quantity,
-    /// Converts to the program's unit: value x factor + offset. The factor is 1 for quantities that packwatch does not
+    /// Value in the program's unit = value x factor + offset. The factor is 1 for quantities that packwatch does not
     /// read.
     pub factor: f64,
-    /// Offset of the conversion, see `factor`.
     pub offset: f64,
 }
 
 impl SignalUnit {
-    /// Parses a unit, ignoring case; `None` = unknown or empty.
+    /// Parses a unit, ignoring case. Returns `None` for an empty or unknown unit.
     pub fn parse(text: &str) -> Option<Self> {
         let plain: String = text.chars().filter(|c| c.is_ascii_alphanumeric() || "%/".contains(*c)).collect();
         let is_degree_sign = plain.is_empty() && text.contains('\u{b0}');
@@ -47,7 +46,7 @@ impl SignalUnit {
             "uv" => (Quantity::Voltage, 1e-6, 0.0),
             "kv" => (Quantity::Voltage, 1e3, 0.0),
             "c" | "degc" | "celsius" | "degcelsius" | "degreec" | "degreesc" => (Quantity::Temperature, 1.0, 0.0),
-            // Absolute zero (degrees C).
+            // Absolute zero.
             "k" | "kelvin" | "degk" => (Quantity::Temperature, 1.0, -273.15),
             "f" | "degf" | "fahrenheit" => (Quantity::Temperature, 5.0 / 9.0, -160.0 / 9.0),
             other => (Quantity::Other(other_quantity(other)?), 1.0, 0.0),
@@ -59,7 +58,7 @@ impl SignalUnit {
 fn other_quantity(plain: &str) -> Option<&'static str> {
     Some(match plain {
         "deg" | "degree" | "degrees" | "rad" => "an angle",
-        // Some files add a remark, such as "%+1".
+        // Some files append a remark, such as "%+1".
         _ if plain.starts_with('%') || matches!(plain, "percent" | "pct") => "a percentage",
         "ah" | "mah" => "a charge",
         "w" | "kw" => "a power",

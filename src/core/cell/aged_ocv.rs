@@ -1,26 +1,23 @@
-//! Computes how a cell type's open-circuit curve changes with lost capacity: voltage offsets over SOC and capacity.
+//! Computes how a cell type's open-circuit curve changes when a cell loses capacity.
 //!
-//! In: the electrodes of the new cell, or a shift of the SOC axis, and the SOC breakpoints of the model. Out: offsets,
-//! V, to be added to the new cell's open-circuit voltage. Offsets are interpolated linearly over SOC and capacity.
-//! Outside the range of capacities in the table, they are constant; below SOC 0 and above SOC 1, they continue
-//! linearly.
+//! In: the SOC breakpoints of the model, and either the electrodes of the new cell or a shift of the SOC axis. Out: a
+//! table of offsets (V), which are added to the new cell's open-circuit voltage. Offsets are interpolated linearly.
+//! Outside the table, they stay constant over the capacity and continue linearly over the SOC.
 //!
-//! # One curve per capacity
-//! The capacity alone does not show how much lithium and how much active material was lost. Assumption: if the cell has
-//! lost a fraction x of its capacity, each electrode has lost the fraction [`MATERIAL_SHARE`] times x of its active
-//! material. The rest of the lost capacity is explained by lost lithium. The share is uncertain. The uncertainty of one
-//! electrode's share is called a mix. [`OffsetLine::mixes_v`] has one entry per mix: the change of the offset if the
-//! share of that electrode is higher by [`MATERIAL_SHARE_STD`].
+//! If a cell has lost a fraction x of its capacity, this module assumes that each electrode has lost the fraction
+//! [`MATERIAL_SHARE`] times x of its active material. Lost lithium explains the rest. The share is uncertain. For each
+//! electrode, the table therefore contains a "mix": the change of the offset if the share of this electrode is higher
+//! by one standard deviation ([`MATERIAL_SHARE_STD`]).
 
 use super::electrodes::{Electrodes, LostMaterial};
 use crate::filter::locate;
 
-/// How the curve's change with ageing is computed.
+/// How an aged curve is computed.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum AgeingLaw {
-    /// The change is computed from a shift of the SOC axis; 0 = the curve over SOC does not change.
+    /// From a shift of the SOC axis. With shift 0, the curve over SOC does not change.
     Shift(f64),
-    /// The change is computed from the electrodes of the new cell.
+    /// From the electrodes of the new cell.
     Electrodes(Electrodes),
 }
 
@@ -30,9 +27,9 @@ impl Default for AgeingLaw {
     }
 }
 
-/// Fraction of active material that each electrode loses, divided by the fraction of capacity lost. It is 0 for
-/// calendar ageing alone, and 1 if material and capacity shrink equally. Graphite cells with layered oxides lose mostly
-/// lithium if they are cycled at moderate temperature (Birkl et al. 2017; Dubarry et al. 2012).
+/// Lost fraction of an electrode's active material, divided by the lost fraction of the capacity. It is 0 for calendar
+/// ageing alone. Graphite cells with layered oxides that are cycled at moderate temperature lose mostly lithium (Birkl
+/// et al. 2017; Dubarry et al. 2012).
 pub const MATERIAL_SHARE: f64 = 0.3;
 
 /// Standard deviation of [`MATERIAL_SHARE`] per electrode.
@@ -41,37 +38,33 @@ pub const MATERIAL_SHARE_STD: f64 = 0.3;
 /// Standard deviation of a shift.
 pub const SHIFT_STD: f64 = 0.3;
 
-/// Capacities of aged cells in the table, relative to the new cell's capacity, rising. The table also has rows for the
-/// new cell and, above it, for one larger capacity. Beyond that capacity, the curve stays constant: such a cell is a
-/// larger cell, not a newer one.
+/// Capacities of the aged cells in the table, relative to the new cell's capacity.
 const LOST_CAPACITIES: [f64; 10] = [0.4, 0.5, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.9, 0.95];
 
-/// The electrodes must give curves down to this fraction of the new cell's capacity, which is a usual end of life.
+/// The electrodes must give curves down to this fraction of the new cell's capacity (a usual end of life).
 const LEAST_KNOWN: f64 = 0.7;
 
 /// Offsets of the open-circuit voltage over capacity and SOC; an empty table means no change.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct AgedOcv {
-    /// Capacities (Ah), rising.
     capacity_ah: Vec<f64>,
-    /// `offset_v[c][s]` (V): row per capacity, column per SOC breakpoint.
+    /// One row per capacity, one column per SOC breakpoint (V).
     offset_v: Vec<Vec<f64>>,
-    /// Change of `offset_v` by one standard deviation of each mix (V); empty = unknown.
+    /// The two mixes (V), each with the shape of `offset_v`; empty = unknown.
     mixes_v: [Vec<Vec<f64>>; MIXES],
-    /// Per capacity: lithium lost, as a fraction of the new cell's lithium, and the change of this loss by one standard
-    /// deviation of each mix. Empty without electrodes.
+    /// One row per capacity: lost lithium, as a fraction of the new cell's lithium, and its change by each mix.
     lithium: Vec<Vec<f64>>,
     is_shift: bool,
     law: AgeingLaw,
-    /// Modes of the curve's spread between cells, added by [`Self::add_spread`]; empty = no spread.
+    /// Modes of the differences between cells (V), set by [`Self::add_spread`].
     spread_v: [Vec<f64>; MIXES],
 }
 
-/// Number of mixes: additional material lost from the negative electrode, and from the positive electrode. With a
-/// shift, the first mix is the uncertainty of the shift, and the second mix is 0.
+/// Number of mixes: one for the negative electrode, one for the positive electrode. If the curve comes from a shift,
+/// the first mix is the uncertainty of the shift, and the second mix is 0.
 pub const MIXES: usize = 2;
 
-/// A quantity over one interval of SOC: its value at SOC 0 and its slope per unit of SOC.
+/// A straight line over SOC: its value at SOC 0 and its slope per unit of SOC.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct SocLine(pub [f64; 2]);
 
@@ -82,14 +75,14 @@ impl SocLine {
     }
 }
 
-/// Difference between the curve near one capacity and the new cell's curve, over one interval of SOC.
+/// Difference between an aged curve and the new cell's curve, over one interval of SOC.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct OffsetLine {
     /// Offset (V).
     pub offset_v: SocLine,
     /// Change of the offset with the capacity (V per Ah).
     pub per_ah_v: SocLine,
-    /// Change of the offset by one standard deviation of each mix (V).
+    /// Change of the offset by each mix (V).
     pub mixes_v: [SocLine; MIXES],
 }
 
@@ -100,22 +93,21 @@ pub struct LithiumLoss {
     pub lost: f64,
     /// Change of the loss with the capacity, per Ah.
     pub per_ah: f64,
-    /// Change of the loss by one standard deviation of each mix.
+    /// Change of the loss by each mix.
     pub mixes: [f64; MIXES],
     /// Change of `mixes` with the capacity, per Ah.
     pub mixes_per_ah: [f64; MIXES],
 }
 
 impl AgedOcv {
-    /// Ageing that follows from the electrodes of the new cell. `None` if they give no curve down to [`LEAST_KNOWN`].
-    /// `rows` contains the new cell's open-circuit voltages (V), one row per temperature.
+    /// Computes the table from the electrodes of the new cell. Returns `None` if the electrodes give no curve down to
+    /// [`LEAST_KNOWN`]. `rows` contains the new cell's open-circuit voltages (V), one row per temperature.
     pub fn of_electrodes(
         electrodes: &Electrodes,
         soc: &[f64],
         new_capacity_ah: f64,
         rows: &[Vec<f64>],
     ) -> Option<Self> {
-        // A row of offsets, and the lithium lost.
         let curve = |negative: f64, positive: f64, part: f64| {
             let lost = LostMaterial { negative: negative * (1.0 - part), positive: positive * (1.0 - part) };
             let aged = electrodes.aged(lost, part)?;
@@ -130,8 +122,6 @@ impl AgedOcv {
             let positive = half_width(curve(MATERIAL_SHARE, low, part)?, curve(MATERIAL_SHARE, high, part)?);
             Some([offset_v, negative, positive])
         };
-        // The capacities of the table go from the new cell down to the lowest capacity at which the electrodes still
-        // form a cell.
         let aged: Vec<_> = LOST_CAPACITIES.iter().rev().map_while(|&part| Some((part, row(part)?))).collect();
         if aged.last().is_none_or(|(part, _)| *part > LEAST_KNOWN) {
             return None;
@@ -149,10 +139,10 @@ impl AgedOcv {
         Some(table)
     }
 
-    /// Ageing that follows from a shift: OCV(s + a s (1 - s)) with a = shift (1 - C / C_new). `rows` contains the new
-    /// cell's open-circuit voltages (V), one row per temperature. The offsets are computed for the middle row. With
-    /// shift 1, each point near the top of the curve keeps its distance from full in Ah. With shift 0, all these
-    /// distances shrink in proportion to the capacity.
+    /// Computes the table from a shift. The aged curve is OCV(s + a s (1 - s)) with a = shift (1 - C / C_new). `rows`
+    /// contains the new cell's open-circuit voltages (V), one row per temperature; the middle row is used. With shift
+    /// 1, each point near the top of the curve keeps its distance from full in Ah. With shift 0, this distance shrinks
+    /// with the capacity.
     pub fn of_shift(shift: f64, soc: &[f64], new_capacity_ah: f64, rows: &[Vec<f64>]) -> Self {
         let mut table = Self { law: AgeingLaw::Shift(shift), ..Self::default() };
         let middle_v = &rows[rows.len() / 2];
@@ -173,8 +163,8 @@ impl AgedOcv {
         table
     }
 
-    /// Adds two rows: the new cell, and above it the mirror image of the smallest loss. The curve then changes smoothly
-    /// around the new cell's capacity.
+    /// Adds a row for the new cell and a row for a larger cell. The larger cell has the offsets of the smallest loss
+    /// with the opposite sign, so that the curve changes smoothly around the new cell's capacity.
     fn finish(&mut self, new_capacity_ah: f64, rows: &[Vec<f64>]) {
         let Some((&aged_ah, aged_v)) = self.capacity_ah.last().zip(self.offset_v.last().cloned()) else { return };
         self.mixes_v.iter_mut().for_each(|table| table.extend(vec![vec![0.0; aged_v.len()]; 2]));
@@ -182,14 +172,14 @@ impl AgedOcv {
         self.push(2.0 * new_capacity_ah - aged_ah, aged_v.iter().map(|offset_v| -offset_v).collect(), rows);
     }
 
-    /// Adds a row of offsets. The new cell's tables can differ from the curve of its electrodes, so the aged curve
-    /// might not rise with the SOC at every temperature. In that case, scales the row down.
+    /// Adds a row of offsets. Scales the row down if the aged curve would otherwise fall with the SOC at some
+    /// temperature. This can happen because the new cell's tables can differ from the curve of its electrodes.
     fn push(&mut self, capacity_ah: f64, mut offset_v: Vec<f64>, rows: &[Vec<f64>]) {
         let factor = rows.iter().flat_map(|row| row.windows(2).zip(offset_v.windows(2))).fold(
             1.0_f64,
             |factor, (new, offset)| {
                 let (rise_v, change_v) = (new[1] - new[0], offset[1] - offset[0]);
-                // The slope of an aged curve is at least a tenth of the new curve's slope everywhere.
+                // The slope of the aged curve must be at least a tenth of the new curve's slope.
                 if change_v < 0.0 { factor.min(0.9 * rise_v / -change_v) } else { factor }
             },
         );
@@ -198,7 +188,7 @@ impl AgedOcv {
         self.offset_v.push(offset_v);
     }
 
-    /// Sets the standard deviation of the shift, initially [`SHIFT_STD`]. Does nothing if the ageing follows from
+    /// Sets the standard deviation of the shift, initially [`SHIFT_STD`]. Does nothing if the curve comes from
     /// electrodes, or after [`Self::add_spread`].
     pub fn set_shift_std(&mut self, std: f64) {
         if self.is_shift {
@@ -206,8 +196,9 @@ impl AgedOcv {
         }
     }
 
-    /// Adds the spread of the curve between cells: adds `modes_v[i]` (V per standard deviation, one value per SOC
-    /// breakpoint) to mix i at every capacity. The sign of the mix is chosen so that mix and mode do not cancel.
+    /// Adds the differences between cells: adds `modes_v[i]` to mix i at every capacity. A mode has one value per SOC
+    /// breakpoint (V per standard deviation). If mix and mode have opposite signs, the mix is negated first, so that
+    /// they do not cancel.
     pub fn add_spread(&mut self, modes_v: &[Vec<f64>; MIXES]) {
         self.is_shift = false;
         self.spread_v.clone_from(modes_v);
@@ -220,17 +211,18 @@ impl AgedOcv {
         }
     }
 
-    /// The source of the ageing.
+    /// How the aged curve is computed.
     pub fn law(&self) -> AgeingLaw {
         self.law
     }
 
-    /// Modes of the curve's spread between cells (V) per standard deviation at the SOC breakpoints; empty = no spread.
+    /// The modes that [`Self::add_spread`] added (V per standard deviation, one value per SOC breakpoint). Empty if
+    /// there are no modes.
     pub fn spread_v(&self) -> &[Vec<f64>; MIXES] {
         &self.spread_v
     }
 
-    /// Offset at a capacity, over the interval that starts at SOC breakpoint `s`.
+    /// Offset at a capacity (Ah), over the interval that starts at SOC breakpoint `s`.
     pub fn line(&self, soc: &[f64], s: usize, capacity_ah: f64) -> OffsetLine {
         let line = |rows: &[Vec<f64>], change: bool| {
             let Some(ends) = self.between(rows, [s, s + 1], capacity_ah) else { return SocLine::default() };
@@ -245,7 +237,7 @@ impl AgedOcv {
         }
     }
 
-    /// Lithium lost at a capacity. Above the new cell's capacity, returns the new cell's loss. Returns `None`
+    /// Lithium lost at a capacity (Ah). Above the new cell's capacity, returns the new cell's loss. Returns `None`
     /// without electrodes or below the smallest capacity in the table.
     pub fn lithium_loss(&self, capacity_ah: f64) -> Option<LithiumLoss> {
         let [least_ah, .., new_ah, _] = self.capacity_ah[..] else { return None };
@@ -259,8 +251,7 @@ impl AgedOcv {
         })
     }
 
-    /// Values of `rows` (one row per capacity) at the SOC breakpoints `at`, and their change per Ah. The values are
-    /// linear between the capacities and constant outside.
+    /// Values of `rows` at the SOC breakpoints `at`, and their change per Ah. Each row belongs to one capacity.
     fn between<const K: usize>(&self, rows: &[Vec<f64>], at: [usize; K], capacity_ah: f64) -> Option<[(f64, f64); K]> {
         let last = rows.len().checked_sub(1)?;
         let above = self.capacity_ah.iter().take_while(|&&border| capacity_ah >= border).count();

@@ -1,13 +1,13 @@
-//! Creates the model of a cell that was never measured, from its label and from the spread between cells of its
+//! Creates the model of a cell that was never measured, from its label and from the differences between cells of its
 //! chemistry.
 //!
-//! In: chemistry, rated capacity (Ah), cut-off voltages (V). Out: a [`CellModel`]. The model's [`ModelSpread`] and the
-//! modes of its curve state how much a cell may differ from the model. No measured cell was used for the curve, so
-//! measured cells can be used to test it.
+//! In: chemistry, rated capacity (Ah), cut-off voltages (V). Out: a [`CellModel`]. Its [`ModelSpread`] and the modes of
+//! its curve state how much a cell may differ from the model. No measured cell was used for the curve, so measured
+//! cells can be used to test it.
 //!
-//! * Open-circuit voltage: mean and covariance over cells built from published half-cell potentials ([`curve`]).
+//! * Open-circuit voltage: mean and covariance of cells built from published half-cell potentials ([`curve`]).
 //! * Resistances: proportional to 1 / capacity, for every chemistry. Geometric means and deviations come from five
-//!   fitted cells of 2.9 to 280 Ah ([`RESISTANCE`]); [`arrhenius`](super::arrhenius) gives other temperatures.
+//!   fitted cells of 2.9 to 280 Ah. [`arrhenius`](super::arrhenius) gives other temperatures.
 
 pub mod curve;
 
@@ -22,7 +22,7 @@ use super::own_model::OwnModel;
 use crate::filter::{ScalarGaussian, interpolate, median};
 use curve::{CellType, CurvePrior, PositiveElectrode};
 
-/// Materials of the two electrodes, as a label or a data sheet states them.
+/// Materials of the two electrodes, as stated on a label or data sheet.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Chemistry {
@@ -32,9 +32,9 @@ pub enum Chemistry {
     NmcGraphite,
     /// NCA with graphite.
     NcaGraphite,
-    /// LCO with graphite: consumer cells.
+    /// LCO with graphite (consumer cells).
     LcoGraphite,
-    /// LMO blended with a layered oxide, and graphite: cells of early electric cars.
+    /// LMO blended with a layered oxide, and graphite (cells of early electric cars).
     LmoGraphite,
     /// LFP with graphite.
     LfpGraphite,
@@ -56,7 +56,7 @@ impl Chemistry {
         Self::ALL.iter().find(|(chemistry, _)| *chemistry == self).map_or("", |found| found.1)
     }
 
-    /// Usual cut-off voltages, lowest and highest (V).
+    /// Usual lowest and highest cut-off voltage (V).
     pub fn usual_voltages_v(self) -> (f64, f64) {
         match self {
             Self::LfpGraphite => (2.5, 3.65),
@@ -65,8 +65,8 @@ impl Chemistry {
         }
     }
 
-    /// Possible materials of the positive electrode. Cells with the same label can have different materials: NMC
-    /// without a number can have any nickel content, and LMO is blended with other materials.
+    /// Possible materials of the positive electrode. NMC without a number can have any nickel content, and LMO is
+    /// blended with other materials.
     fn positives(self) -> Vec<PositiveElectrode> {
         let blend = |share: f64| PositiveElectrode::blend(Positive::Lmo, share, Positive::Nco);
         match self {
@@ -79,21 +79,21 @@ impl Chemistry {
         }
     }
 
-    /// Minimum and maximum distance of a full cell's open-circuit voltage below its highest voltage (V). A charge ends
+    /// How far a full cell's open-circuit voltage is below the highest voltage (V): minimum and maximum. A charge ends
     /// while some current still flows, so the voltage falls when the cell relaxes. It falls most if the curve is steep
     /// at its upper end.
     fn full_below_v(self) -> [f64; 2] {
         if self == Self::LfpGraphite { [0.05, 0.22] } else { [0.005, 0.035] }
     }
 
-    /// Half of the open-circuit voltage's hysteresis between charge and discharge (V): Dreyer et al., Nature
-    /// Mater. 9 (2010) 448 for LFP; silicon in graphite for the others.
+    /// Half of the hysteresis of the open-circuit voltage between charge and discharge (V). LFP: Dreyer et al., Nature
+    /// Mater. 9 (2010) 448. Other chemistries: silicon in graphite.
     fn hysteresis_v(self) -> f64 {
         if self == Self::LfpGraphite { 0.010 } else { 0.004 }
     }
 }
 
-/// The label of a cell.
+/// Chemistry, rated capacity and voltage limits, as printed on a cell.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Label {
@@ -101,13 +101,13 @@ pub struct Label {
     pub chemistry: Chemistry,
     /// Rated capacity (Ah).
     pub rated_ah: f64,
-    /// Lowest voltage (V).
+    /// Lowest cut-off voltage (V).
     pub voltage_min_v: f64,
-    /// Highest voltage (V).
+    /// Highest cut-off voltage (V).
     pub voltage_max_v: f64,
 }
 
-/// What is known about a cell before its own data: from its label alone ([`Label::prior`]), or also from other vehicles
+/// Prior of a cell without own data: from its label ([`Label::prior`]), or also from other vehicles
 /// ([`FleetPrior::prior`](super::FleetPrior::prior)).
 #[derive(Debug, Clone)]
 pub struct LabelPrior {
@@ -117,36 +117,34 @@ pub struct LabelPrior {
     pub model: CellModel,
     /// Open-circuit curve of the label's mean cell, and the covariance between cells.
     pub curve: CurvePrior,
-    /// Expected model; `None` = the label's mean cell.
+    /// Expected model; `None` = the model of the label's mean cell.
     pub expected: Option<OwnModel>,
-    /// Standard deviation of ln(resistance) between cells, relative to the standard deviation of the label.
+    /// Standard deviation of ln(resistance) between cells, divided by the label's standard deviation.
     pub log_resistance_ratio: f64,
-    /// Standard deviation of the fall of the curve in the cold (V).
+    /// Standard deviation of the curve's sag in the cold (V).
     pub cold_sag_std_v: f64,
-    /// Standard deviation of the capacity, fraction.
+    /// Standard deviation of the capacity (fraction).
     pub capacity_std: f64,
 }
 
-/// SOC breakpoints of a model from a label.
 pub(super) const SOC: [f64; 21] =
     [0.0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.9, 0.95, 1.0];
 
-/// Temperature breakpoints (degrees C); Arrhenius' law interpolates between them.
+/// Temperature breakpoints (degrees C). Arrhenius' law interpolates between them.
 pub(super) const TEMPERATURE_C: [f64; TEMPERATURE_NODES] = [-30.0, 0.0, 25.0, 60.0];
 /// Number of temperature breakpoints.
 pub const TEMPERATURE_NODES: usize = 4;
 
 /// One resistance of a usual cell at 25 degrees C.
 struct UsualResistance {
-    /// Resistance times capacity at half charge (ohm) Ah.
+    /// Resistance times capacity at SOC 0.5 (ohm Ah).
     ohm_ah: f64,
     /// Time constant (s); 0 = series resistance.
     tau_s: f64,
-    /// Resistance at each SOC of [`SHAPE_SOC`], relative to the resistance at half charge.
+    /// Resistance at each SOC of [`SHAPE_SOC`], relative to the resistance at SOC 0.5.
     shape: [f64; 5],
 }
 
-/// SOC of [`UsualResistance::shape`].
 const SHAPE_SOC: [f64; 5] = [0.0, 0.05, 0.1, 0.2, 1.0];
 
 /// Number of resistances: the series resistance and one per branch.
@@ -162,14 +160,13 @@ pub const FACTOR_SOC: [f64; 9] = [0.0, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 1.0
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ResistanceFactors {
-    /// ln of each resistance's ratio at 25 degrees C, at [`FACTOR_SOC`].
+    /// ln of each resistance ratio at 25 degrees C, at [`FACTOR_SOC`].
     pub ln: [[f64; FACTOR_SOC.len()]; RESISTANCES],
-    /// Deviation of each resistance's activation energy from the usual activation energy, fraction.
+    /// Relative deviation (fraction) of each activation energy from the usual activation energy.
     pub by_temperature: [f64; RESISTANCES],
 }
 
 impl ResistanceFactors {
-    /// Ratio of resistance `j` to the resistance of the label's model.
     fn ratio(&self, j: usize, soc: f64, arrhenius: f64) -> f64 {
         libm::exp(interpolate(&FACTOR_SOC, &self.ln[j], soc) + self.by_temperature[j] * libm::log(arrhenius))
     }
@@ -180,17 +177,17 @@ impl ResistanceFactors {
 pub struct CurveOfCells {
     /// Mean (V), rising.
     pub mean_v: Vec<f64>,
-    /// Largest modes of the spread (V) per standard deviation.
+    /// Modes of the differences between cells (V per standard deviation).
     pub modes_v: [Vec<f64>; MIXES],
-    /// Standard deviation of the spread that the modes do not explain (V).
+    /// Standard deviation of the differences that the modes do not explain (V).
     pub rest_v: Vec<f64>,
-    /// Fall of the curve from 25 to 0 degrees C (V) ([`cold_share`]).
+    /// Sag of the curve at 0 degrees C (V) (see [`cold_share`]).
     pub cold_sag_v: ScalarGaussian,
     /// Electrodes that give a curve like the mean; `None` for blends.
     pub electrodes: Option<Electrodes>,
 }
 
-/// Geometric means over models fitted to Panasonic 18650PF, LG HG2, LG M50 (simulated), EVE LF280 and a Leaf cell.
+/// Geometric means of models fitted to Panasonic 18650PF, LG HG2, LG M50 (simulated), EVE LF280 and a Leaf cell.
 const RESISTANCE: [UsualResistance; RESISTANCES] = [
     UsualResistance { ohm_ah: 0.073, tau_s: 0.0, shape: [1.6, 1.4, 1.25, 1.08, 1.0] },
     UsualResistance { ohm_ah: 0.031, tau_s: 10.0, shape: [3.5, 2.5, 1.8, 1.2, 1.1] },
@@ -203,13 +200,12 @@ pub(super) fn cold_share(temperature_c: f64) -> f64 {
     ((25.0 - temperature_c) / 25.0).max(0.0)
 }
 
-/// Sag of the curve under load: how much lower it is at 0 degrees C than at 25 degrees C, mean and standard deviation,
-/// V.
+/// Sag of the curve under load: how much lower it is at 0 degrees C than at 25 degrees C (V).
 ///
 /// The charge-transfer resistance is larger at small currents than at large currents (Butler-Volmer), especially in the
-/// cold. The model's resistances hold at large currents, so the difference is nearly a constant voltage. It was
-/// determined from the SOC errors of the label's model at 10, 0 and -10 degrees C: LG HG2 0.03 V, Panasonic 0.03 V
-/// (0.01 V of this is ageing), Leaf cell -0.01 V (only at 10 degrees C), simulated LG M50 0.
+/// cold. The model's resistances hold at large currents, so the difference is nearly a constant voltage. The value
+/// follows from the SOC errors of the label's model at 10, 0 and -10 degrees C: LG HG2 0.03 V, Panasonic 0.03 V (0.01 V
+/// of this is ageing), Leaf cell -0.01 V (only at 10 degrees C), simulated LG M50 0.
 pub(super) fn usual_cold_sag_v() -> ScalarGaussian {
     ScalarGaussian::from_std(0.015, 0.015)
 }
@@ -228,18 +224,18 @@ impl Label {
         Self { chemistry, rated_ah, voltage_min_v, voltage_max_v }
     }
 
-    /// The label with another chemistry. Keeps the cut-off voltages if they suit the new chemistry; otherwise uses the
-    /// usual cut-off voltages of the new chemistry.
+    /// The label with another chemistry. If the cut-off voltages do not suit the new chemistry, its usual cut-off
+    /// voltages replace them.
     pub fn with_chemistry(&self, chemistry: Chemistry) -> Self {
         let (low_v, high_v) = chemistry.usual_voltages_v();
-        // The cut-off voltages suit the chemistry if the highest voltage is within 0.2 V of the usual one.
+        // The highest voltage must be within 0.2 V of the usual highest voltage.
         let is_usual = (self.voltage_max_v - high_v).abs() <= 0.2;
         let (voltage_min_v, voltage_max_v) =
             if is_usual { (self.voltage_min_v, self.voltage_max_v) } else { (low_v, high_v) };
         Self { chemistry, voltage_min_v, voltage_max_v, ..*self }
     }
 
-    /// Mean and spread of the open-circuit curves of cells with this label; `None` if no cell of this chemistry has
+    /// Mean and covariance of the open-circuit curves of cells with this label; `None` if no cell of this chemistry has
     /// these cut-off voltages.
     pub fn curve(&self) -> Option<CurvePrior> {
         let full_v = self.chemistry.full_below_v().map(|below_v| self.voltage_max_v - below_v);
@@ -254,25 +250,24 @@ impl Label {
         CurvePrior::new(&cell_type, &SOC)
     }
 
-    /// Model of a cell with this label; `None` if no cell of this chemistry has these cut-off voltages.
+    /// Model of the label's mean cell. Returns `None` in the same case as [`Self::curve`].
     pub fn model(&self) -> Option<CellModel> {
         self.prior().map(|prior| prior.model)
     }
 
-    /// Model and curve of a cell with this label; `None` if no cell of this chemistry has these cut-off voltages.
+    /// Prior of a cell with this label. Returns `None` in the same case as [`Self::curve`].
     pub fn prior(&self) -> Option<LabelPrior> {
         let curve = self.curve()?;
         let (modes_v, rest_v) = curve.modes_v();
         let spread = ModelSpread {
             curve_v: median(rest_v.iter().copied()).unwrap_or_default(),
-            // Spread of the five fitted cells. Away from 25 degrees C, the temperature law adds to it.
+            // From the five fitted cells. Away from 25 degrees C, the temperature law adds uncertainty.
             log_resistance: 0.45,
-            // Spread of the same five cells.
             slow_branch: 0.5,
             // Tolerance and age of the cell.
             capacity: 0.1,
-            // This is an error of 40 % of the drop; the error persists for 100 s. Cells differ in how their resistance
-            // depends on time, SOC and temperature. Chosen on LG HG2 from 0 to -10 degrees C.
+            // The drop has an error of 40 % that persists for 100 s, because the resistances of cells depend
+            // differently on time, SOC and temperature. Chosen on LG HG2 from 0 to -10 degrees C.
             drop_sqrt_s: 4.0,
         };
         let CurvePrior { mean_v, electrodes, .. } = curve.clone();
@@ -293,7 +288,7 @@ impl Label {
 
     /// The model of a cell with this present capacity (Ah), curve and resistances. `drop_std` is the standard deviation
     /// of ln(voltage drop) at each temperature of the tables. Multiplied by the voltage drop at [`USUAL_LOAD_PER_H`],
-    /// it counts as voltage error of the model.
+    /// it counts as a voltage error of the model.
     pub fn model_of(
         &self,
         capacity_ah: f64,
@@ -307,7 +302,7 @@ impl Label {
         let mut aged_ocv = curve
             .electrodes
             .and_then(|electrodes| AgedOcv::of_electrodes(&electrodes, &SOC, capacity_ah, &rows))
-            // Used if the positive electrode is a blend, or if the electrodes give no curve for an aged cell.
+            // Used for blends, and for electrodes that give no curve for an aged cell.
             .unwrap_or_else(|| AgedOcv::of_shift(0.5, &SOC, capacity_ah, &rows));
         aged_ocv.add_spread(&curve.modes_v);
         let table = |j: usize| {
@@ -357,8 +352,8 @@ impl Label {
     }
 }
 
-/// Load at which an error of the resistances is converted to a voltage error of the model: C/2, stated as current
-/// divided by rated capacity, 1/h.
+/// Load at which errors of resistances are converted to voltage errors of the model: current divided by rated capacity
+/// (1/h).
 pub const USUAL_LOAD_PER_H: f64 = 0.5;
 
 #[cfg(test)]

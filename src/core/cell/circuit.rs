@@ -1,9 +1,11 @@
-//! The equations of the equivalent circuit (paper, section 3.3.1), shared by the estimator and the simulator.
+//! The equations of the equivalent circuit, for the estimator and the simulator.
 //!
 //! State: SOC (fraction) and one voltage per RC branch (V). I > 0 is discharge.
+//!
 //! dSOC/dt = -I / (3600 C); dU/dt = -U/(R1 C1) + I/C1; V = OCV(SOC, T) - sum U - I R0.
-//! Ageing multiplies R0 and every branch resistance by the same ratio; the time constants do not change. Inputs are not
-//! checked: a NaN gives a NaN.
+//!
+//! Source: "Battery Predictions for Electronic Prognostics", section 3.3.1. Ageing multiplies R0 and every branch
+//! resistance by the same ratio and keeps the time constants. Inputs are not checked: NaN gives NaN.
 
 use super::config::Discretisation;
 use super::model::{CellModel, GridPosition, TemperaturePosition};
@@ -23,13 +25,13 @@ pub struct BranchAt {
 }
 
 impl BranchAt {
-    /// Branch `i` of a cell. The cell's resistances are `resistance_ratio` times the resistances of `model`.
+    /// Branch `i` of a cell whose resistances are `resistance_ratio` times those of `model`.
     pub fn new(model: &CellModel, i: usize, position: &GridPosition, resistance_ratio: f64) -> Self {
         Self { r_ohm: model.branch_r_ohm(i, position) * resistance_ratio, tau_s: model.branch_tau_s(i, position) }
     }
 
-    /// The branch's voltage after `dt_s` at a constant `current_a`. Euler's rule overshoots in steps longer than the
-    /// time constant (gaps), so such steps are always exact.
+    /// The branch's voltage (V) after `dt_s` at a constant `current_a`. In steps longer than the time constant, Euler's
+    /// rule would overshoot, so such steps are always exact.
     pub fn voltage_after(&self, rule: Discretisation, branch_v: f64, current_a: f64, dt_s: f64) -> f64 {
         let settled_v = self.r_ohm * current_a;
         match rule {
@@ -41,8 +43,8 @@ impl BranchAt {
     }
 }
 
-/// Terminal voltage (V) under `current_a`, with the open-circuit curve of a new cell. `branches_v` is the sum of the
-/// branch voltages.
+/// Terminal voltage (V) of a cell with the open-circuit curve of a new cell. `branches_v` is the sum of the branch
+/// voltages.
 pub fn terminal_v(
     model: &CellModel,
     position: &GridPosition,
@@ -53,8 +55,8 @@ pub fn terminal_v(
     model.ocv_v(position) - branches_v - model.r0_ohm(position) * resistance_ratio * current_a
 }
 
-/// Terminal voltage (V) of an aged cell under `current_a`. `state` = (SOC, resistance ratio, capacity in Ah);
-/// `branches_v` is the sum of the branch voltages.
+/// Terminal voltage (V) of an aged cell. `state` = (SOC, resistance ratio, capacity in Ah). `branches_v` is the sum of
+/// the branch voltages.
 pub fn aged_terminal_v(
     model: &CellModel,
     state: (f64, f64, f64),
@@ -68,8 +70,8 @@ pub fn aged_terminal_v(
     ocv_v - branches_v - model.r0_ohm(&position) * resistance_ratio * current_a
 }
 
-/// Temperature after `dt_s` of the lumped thermal model C dT/dt = losses - (T - ambient)/R, exact for
-/// constant losses (W).
+/// Temperature after `dt_s` in the lumped thermal model C dT/dt = losses - (T - ambient)/R. Exact for constant losses
+/// (W).
 pub fn temperature_after(
     thermal: &super::Thermal,
     temperature_c: f64,

@@ -1,20 +1,21 @@
-//! Settings of the per-cell estimator. The configuration checks their ranges; the estimator does not.
+//! Settings of the per-cell estimator. The configuration checks their ranges. "The paper" is "Battery Predictions for
+//! Electronic Prognostics".
 
 use crate::filter::ScalarGaussian;
 
 /// How the circuit's equations are integrated over a step.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Discretisation {
-    /// exp(-dt/RC): exact if the current is constant during the step.
+    /// exp(-dt/RC), which is exact if the current is constant during the step.
     Exact,
     /// Forward Euler, as in the paper.
     Euler,
 }
 
-/// Whether the sample-by-sample filter estimates the capacity.
+/// Whether the filter estimates the capacity.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum CapacityState {
-    /// The capacity is a state, estimated together with the SOC and their correlation.
+    /// The capacity is a state and is estimated together with the SOC.
     Joint,
     /// The capacity is held at the last learned value, as in the paper.
     Held,
@@ -48,20 +49,20 @@ pub struct EstimatorConfig {
 /// Spread and weights of the sigma points.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SigmaPointSettings {
-    /// Sigma point spread alpha, (0, 1].
+    /// Spread alpha of the sigma points, above 0 and at most 1.
     pub alpha: f64,
-    /// Sigma point weight beta: prior knowledge of the distribution, 2 for a Gaussian distribution.
+    /// Weight beta of the centre, from knowledge of the distribution; 2 for a Gaussian distribution.
     pub beta: f64,
     /// Secondary scaling kappa of the sigma points.
     pub kappa: f64,
 }
 
-/// Initial state of a filter, with its uncertainty.
+/// Initial state of a filter with its uncertainty.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct InitialState {
-    /// Initial SOC, fraction; `None` = from the first voltage and the OCV curve.
+    /// Initial SOC (fraction); `None` = from the first voltage and the OCV curve.
     pub soc: Option<f64>,
-    /// Standard deviation of the initial SOC, fraction.
+    /// Standard deviation of the initial SOC (fraction).
     pub soc_std: f64,
     /// Standard deviation of the initial branch voltages (V).
     pub branch_std_v: f64,
@@ -69,7 +70,8 @@ pub struct InitialState {
     pub capacity_ah: f64,
     /// Standard deviation of the initial capacity (Ah).
     pub capacity_std_ah: f64,
-    /// Capacity (Ah) that selects the open-circuit curve of the aged cell until the first half-cycle has ended.
+    /// Capacity (Ah) that selects the open-circuit curve of the aged cell until the first charge or discharge has
+    /// ended.
     pub curve: ScalarGaussian,
     /// Standard deviation of the initial ln(resistance relative to new).
     pub log_resistance_std: f64,
@@ -78,30 +80,30 @@ pub struct InitialState {
 /// Densities of the process noise while the current is measured.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ProcessNoise {
-    /// SOC process noise, fraction per sqrt(s).
+    /// Noise of the SOC (fraction per sqrt(s)).
     pub soc_per_sqrt_s: f64,
-    /// SOC process noise caused by random errors of the current: fraction per square root of the charge moved, where
-    /// the charge is a fraction of the capacity.
+    /// Noise of the SOC caused by random errors of the current: fraction per square root of the charge moved. The
+    /// charge is a fraction of the capacity.
     pub charge_per_sqrt_soc: f64,
-    /// Branch voltage process noise (V) per sqrt(s).
+    /// Noise of a branch voltage (V per sqrt(s)).
     pub branch_v_per_sqrt_s: f64,
-    /// ln(resistance) process noise, per sqrt(s).
+    /// Noise of ln(resistance) (1 per sqrt(s)).
     pub log_resistance_per_sqrt_s: f64,
 }
 
 /// Possible change of the SOC while no current is measured.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GapSettings {
-    /// SOC process noise, fraction per sqrt(s).
+    /// Process noise of the SOC (fraction per sqrt(s)).
     pub noise_per_sqrt_s: f64,
-    /// Largest self-discharge, fraction of SOC per s.
+    /// Largest self-discharge (fraction of SOC per s).
     pub self_discharge_per_s: f64,
-    /// Maximum rate at which the SOC changes by use or charging while the program does not run, fraction of SOC per s.
+    /// Largest change of the SOC by use or charging while the program does not run (fraction of SOC per s).
     pub away_use_per_s: f64,
-    /// Largest current of a resting cell (A) per cell. If the current before or after a gap is larger, it may also have
-    /// flowed during the gap.
+    /// Largest current (A) of a resting cell. A larger current before or after a gap may also have flowed during the
+    /// gap.
     pub rest_current_a: f64,
-    /// Whether the cell counts as resting in every gap of more than 5 s without a measured current, regardless of the
+    /// Whether the cell counts as resting in every gap of more than 5 s without a measured current, whatever the
     /// current before and after the gap.
     pub silence_is_rest: bool,
 }
@@ -111,32 +113,31 @@ pub struct GapSettings {
 pub struct VoltageError {
     /// White sensor noise of one voltage reading (V).
     pub noise_v: f64,
-    /// Slow model error: standard deviation of its average over one second (V). It is used if the cell model states no
-    /// error.
+    /// Slow model error: standard deviation of its average over one second (V). Used if the cell model states no error.
     pub model_error_v_sqrt_s: f64,
-    /// Model error proportional to the present voltage drop in the cell: fraction of the drop, for an average over one
+    /// Model error proportional to the present voltage drop in the cell: fraction of the drop, averaged over one
     /// second.
     pub drop_error_sqrt_s: f64,
-    /// Model error proportional to the voltage drop caused by the load of the last minutes: fraction of this drop, for
-    /// an average over one second.
+    /// Model error proportional to the voltage drop caused by the load of the last minutes: fraction of this drop,
+    /// averaged over one second.
     pub load_error_sqrt_s: f64,
-    /// Time constant of the model error after a load has ended (slow diffusion) (s).
+    /// Time constant (s) with which the model error decays after a load has ended (slow diffusion).
     pub load_memory_s: f64,
-    /// Maximum time that one voltage reading represents (s). If readings are further apart, this time is used.
+    /// A voltage reading represents at most this time (s), even if readings are further apart.
     pub max_information_s: f64,
 }
 
 /// Standard deviations of the sensors' constant errors. The filter considers them, so they never average out.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SensorErrors {
-    /// Offset of a cell's voltage (V). It includes a constant error of the model's open-circuit curve.
+    /// Offset of a cell's voltage (V), including a constant error of the model's open-circuit curve.
     pub voltage_offset_v: f64,
-    /// Uncertainty of the current sensor's offset that remains after learning (A) per cell.
+    /// Offset of the current sensor (A) per cell that remains after learning.
     pub current_offset_a: f64,
-    /// Gain error of the current, fraction.
+    /// Gain error of the current (fraction).
     pub current_gain: f64,
-    /// Uncertainty (fraction) of the resistance of the model's slowest branch that remains after learning, in addition
-    /// to the common error of all resistances.
+    /// Error of the slowest branch's resistance (fraction) that remains after learning, in addition to the common error
+    /// of all resistances.
     pub slow_branch: f64,
 }
 
@@ -150,12 +151,12 @@ impl SensorErrors {
 pub struct GateSettings {
     /// Maximum accepted innovation, in standard deviations.
     pub sigma: f64,
-    /// Model error of a single reading (V) (standard deviation). The gate and the consistency monitor use this value.
-    /// If they used the error per second instead, they would accept every reading at high sample rates.
+    /// Model error of a single reading (V, standard deviation) for the gate and the consistency monitor. With the error
+    /// per second instead, the gate and the monitor would accept every reading at high sample rates.
     pub model_error_v: f64,
-    /// Model error of a single reading along the OCV curve, fraction of SOC.
+    /// Model error of a single reading along the OCV curve (fraction of SOC).
     pub soc_error: f64,
-    /// If all readings during this time (s) were beyond the gate, the filter restarts from the voltage.
+    /// If all readings during this time (s) are beyond the gate, the filter restarts from the voltage.
     pub lost_after_s: f64,
 }
 
@@ -164,6 +165,6 @@ pub struct GateSettings {
 pub struct ConsistencySettings {
     /// Window of the consistency monitor (s).
     pub window_s: f64,
-    /// Maximum mean normalised innovation squared of an estimate that is trusted.
+    /// Maximum mean normalised innovation squared of a trusted estimate.
     pub limit: f64,
 }

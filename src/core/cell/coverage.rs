@@ -1,15 +1,13 @@
-//! Determines the ranges of SOC and temperature that the data cover.
+//! Determines which ranges of SOC and temperature the data cover.
 //!
-//! In: SOC (fraction) and temperature (degrees C) of readings, or of notebook rows (means over several readings); NaN
-//! and infinities are ignored. Out: the covered share of the SOC range, and the covered ranges of SOC and temperature.
+//! In: SOC (fraction) and temperature (degrees C) of readings or of notebook rows. NaN and infinities are ignored. Out:
+//! the covered share of the SOC range, and the covered ranges of SOC and temperature.
 
 use std::collections::BTreeMap;
 
 use super::notebook::Row;
 
-/// Number of equal parts of the SOC range.
 const PARTS: usize = 10;
-/// Width of a temperature class (K).
 const CLASS_K: f64 = 10.0;
 
 /// Number of readings per part of the SOC range and per temperature class.
@@ -45,12 +43,12 @@ impl Coverage {
         self.soc.iter().all(|count| *count == 0)
     }
 
-    /// Covered fraction of the SOC range, as a multiple of one tenth.
+    /// Covered fraction of the SOC range, in steps of one tenth.
     pub fn soc_share(&self) -> f64 {
         self.soc.iter().filter(|count| **count > 0).count() as f64 / PARTS as f64
     }
 
-    /// Covered ranges of the SOC, fractions.
+    /// Covered ranges of the SOC (fractions).
     pub fn soc_ranges(&self) -> Vec<[f64; 2]> {
         let parts = (0..PARTS).filter(|part| self.soc[*part] > 0);
         let whole = |value: usize| i32::try_from(value).unwrap_or(i32::MAX);
@@ -64,7 +62,7 @@ impl Coverage {
     }
 }
 
-/// Joins neighbouring classes into ranges. A range is [first class, last class + 1].
+/// Joins neighbouring classes into ranges [first class, last class + 1].
 fn ranges(classes: impl Iterator<Item = i32>) -> Vec<[i32; 2]> {
     let mut ranges: Vec<[i32; 2]> = Vec::new();
     for class in classes {

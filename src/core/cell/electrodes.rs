@@ -1,16 +1,16 @@
-//! The two electrodes of a cell: open-circuit voltage as the difference of two half-cell potentials, new and aged.
+//! Computes a cell's open-circuit voltage from the potentials of its two electrodes, for the new and the aged cell.
 //!
-//! V(z) = U_p(y) - U_n(x): x and y are the lithium contents (stoichiometry, 0 to 1) of the negative and the positive
-//! electrode. Both are linear in the charge. The electrodes' capacities Q_n, Q_p and the cyclable lithium n are
-//! relative to the new cell's capacity: Q_p y + Q_n x = n. An aged cell is full and empty at the same voltages V as the
-//! new cell. Its capacity is Q_n (x_full - x_empty).
+//! V(z) = U_p(y) - U_n(x), where z is the SOC, and x and y are the lithium contents (stoichiometry, 0 to 1) of the
+//! negative and the positive electrode. Both contents are linear in the charge. Q_n and Q_p are the capacities of the
+//! electrodes, and n is the cyclable lithium, all relative to the new cell's capacity: Q_p y + Q_n x = n. An aged cell
+//! is full and empty at the same voltages as the new cell. Its capacity is Q_n (x_full - x_empty).
 //!
 //! An ageing cell loses lithium (n falls) and active material of the electrodes (Q_n and Q_p fall): Birkl et al., J.
 //! Power Sources 341 (2017) 373; Dubarry et al., J. Power Sources 219 (2012) 204. The lithium content of the lost
 //! material need not be known, because it only changes n, and n follows from the capacity.
 //!
 //! In: materials and lithium contents of the new cell. Out: V, and capacity as a fraction of the new cell's capacity.
-//! Contents are limited to 0 to 1. If no cell remains after a loss, there is no curve. An ageing cell never gains
+//! Contents are limited to 0 to 1. If no such cell exists after a loss, there is no curve. An ageing cell never gains
 //! lithium.
 
 use crate::filter::crossing;
@@ -57,7 +57,7 @@ pub enum NegativeMaterial {
 }
 
 impl PositiveMaterial {
-    /// Every material, with its name in a cell model.
+    /// Every material, with its name in a cell model file.
     pub const ALL: [(Self, &'static str); 8] = [
         (Self::Nmc811, "nmc811"),
         (Self::Nmc532, "nmc532"),
@@ -69,7 +69,7 @@ impl PositiveMaterial {
         (Self::Lfp, "lfp"),
     ];
 
-    /// Minimum lithium content at which the function is valid. Below it, the published functions rise or have poles.
+    /// Minimum valid lithium content. Below it, the published functions rise or have poles.
     pub const fn least_content(self) -> f64 {
         match self {
             Self::Nca => 0.3,
@@ -79,8 +79,7 @@ impl PositiveMaterial {
         }
     }
 
-    /// Potential against lithium (V) at a lithium content. Outside the valid contents, returns the potential at the
-    /// nearest valid content.
+    /// Potential against lithium (V) at a lithium content, which is limited to the valid contents.
     pub fn potential_v(self, y: f64) -> f64 {
         use libm::{exp, pow, tanh};
         let y = y.clamp(self.least_content(), 1.0 - EDGE);
@@ -131,7 +130,7 @@ impl PositiveMaterial {
 }
 
 impl NegativeMaterial {
-    /// Every material, with its name in a cell model.
+    /// Every material, with its name in a cell model file.
     pub const ALL: [(Self, &'static str); 6] = [
         (Self::GraphiteSiox, "graphite_siox"),
         (Self::Graphite, "graphite"),
@@ -141,8 +140,7 @@ impl NegativeMaterial {
         (Self::McmbRamadass, "mcmb_ramadass"),
     ];
 
-    /// Potential against lithium (V) at a lithium content. Outside the range limited by [`EDGE`], returns the potential
-    /// at the edge.
+    /// Potential against lithium (V) at a lithium content, which is limited to the range from [`EDGE`] to 1 - [`EDGE`].
     pub fn potential_v(self, x: f64) -> f64 {
         use libm::{exp, tanh};
         let x = x.clamp(EDGE, 1.0 - EDGE);
@@ -234,12 +232,11 @@ pub struct AgedElectrodes {
     negative_capacity: f64,
     positive_capacity: f64,
     lithium: f64,
-    /// Lithium content of the negative electrode, empty and full.
     negative_content: [f64; 2],
 }
 
 impl Electrodes {
-    /// Names of the positive and the negative material in a cell model.
+    /// Names of the positive and the negative material in a cell model file.
     pub fn names(&self) -> (&'static str, &'static str) {
         let positive = PositiveMaterial::ALL.iter().find(|(material, _)| *material == self.positive);
         let negative = NegativeMaterial::ALL.iter().find(|(material, _)| *material == self.negative);
@@ -253,17 +250,18 @@ impl Electrodes {
             - self.negative.potential_v(between(self.negative_content))
     }
 
-    /// Capacity of the new negative electrode, capacity of the new positive electrode, and cyclable lithium, all
-    /// relative to the cell's capacity.
+    /// Capacities of the new negative and positive electrodes, and cyclable lithium, all relative to the cell's
+    /// capacity.
     fn new_contents(&self) -> [f64; 3] {
         let negative = 1.0 / (self.negative_content[1] - self.negative_content[0]);
         let positive = 1.0 / (self.positive_content[0] - self.positive_content[1]);
         [negative, positive, negative * self.negative_content[1] + positive * self.positive_content[1]]
     }
 
-    /// The cell after it has lost the material `lost`, and so much lithium that only the fraction `capacity` of the new
-    /// capacity remains. Returns `None` in three cases: such a cell does not exist; it cannot reach its end voltages;
-    /// or the new cell contains more lithium than it can use, so the capacity does not determine the loss.
+    /// The cell after it has lost the material `lost`, and so much lithium that the fraction `capacity` of the new
+    /// capacity remains. Returns `None` if such a cell does not exist or cannot reach its end voltages. Also returns
+    /// `None` if the new cell contains more lithium than it can use, because the capacity then does not determine the
+    /// loss.
     pub fn aged(&self, lost: LostMaterial, capacity: f64) -> Option<AgedElectrodes> {
         let [negative, positive, new_lithium] = self.new_contents();
         let ends_v = [0.0, 1.0].map(|soc| self.voltage_v(soc));
@@ -292,20 +290,19 @@ impl Electrodes {
 }
 
 impl AgedElectrodes {
-    /// Voltage (V) at a lithium content of the negative electrode. It rises with the content.
+    /// Voltage (V) at a lithium content of the negative electrode. The voltage rises with the content.
     fn voltage_at(&self, x: f64) -> f64 {
         let y = (self.lithium - self.negative_capacity * x) / self.positive_capacity;
         self.electrodes.positive.potential_v(y) - self.electrodes.negative.potential_v(x)
     }
 
-    /// Lithium content of the negative electrode at which the cell has this voltage.
     fn content_at(&self, voltage_v: f64) -> f64 {
         let low = ((self.lithium - self.positive_capacity) / self.negative_capacity).max(EDGE);
         let high = (self.lithium / self.negative_capacity).min(1.0 - EDGE);
         crossing((low, high), |x| self.voltage_at(x) < voltage_v)
     }
 
-    /// Capacity relative to the new cell's.
+    /// Capacity relative to the new cell.
     pub fn capacity(&self) -> f64 {
         self.negative_capacity * (self.negative_content[1] - self.negative_content[0])
     }
@@ -316,7 +313,7 @@ impl AgedElectrodes {
         self.voltage_at(empty + soc * (full - empty))
     }
 
-    /// Cyclable lithium lost, as a fraction of the new cell's.
+    /// Cyclable lithium lost, as a fraction of the new cell's lithium.
     pub fn lithium_lost(&self) -> f64 {
         1.0 - self.lithium / self.electrodes.new_contents()[2]
     }

@@ -1,15 +1,16 @@
-//! Combines the models that many vehicles have learned for one label into a prior for the next vehicle.
+//! Combines the models that many vehicles have learned into a prior for the next vehicle. All vehicles have cells with
+//! the same label (chemistry, rated capacity, voltage limits).
 //!
 //! In: one [`OwnModel`] per vehicle. Out: a [`FleetPrior`], which replaces the values that are typical of the
 //! chemistry.
 //!
-//! Each quantity (the curve at each SOC, a resistance, the capacity) varies between the cells of the label with an
-//! unknown variance P. A vehicle's fit gives the mean m and the posterior variance V; it started from the label's
-//! variance L. A fit pulls its mean toward the label's mean, so the means vary less than the cells. The missing part is
-//! V^2 / L: the share of V that comes from the label (Joseph form of the update). The estimate of P is the variance of
-//! the means plus this part. For the curve, L is a covariance matrix over the SOC breakpoints. Each vehicle scales its
-//! rows and columns by V / L at that SOC. Few vehicles say little about P, so the label's covariance counts as
-//! [`LABEL_VEHICLES`] more vehicles.
+//! Each quantity (a point of the curve, a resistance, the capacity) varies between cells with an unknown variance P. A
+//! vehicle's fit starts from the label's variance L and gives a mean and a posterior variance V. The fit pulls the mean
+//! toward the label's mean, so the means vary less than the cells. The missing variance is V^2 / L (Joseph form of the
+//! update). P is estimated as the variance of the means plus V^2 / L.
+//!
+//! For the curve, L is a covariance matrix over the SOC breakpoints, and each vehicle scales its rows and columns by V
+//! / L. Because few vehicles say little about P, the label's covariance counts as [`LABEL_VEHICLES`] more vehicles.
 
 use nalgebra::DMatrix;
 use serde::{Deserialize, Serialize};
@@ -24,7 +25,7 @@ use crate::quantity::InvalidState;
 /// Weight of the label's variance, as a number of vehicles.
 const LABEL_VEHICLES: f64 = 2.0;
 
-/// What is known about a cell of a label after other vehicles with this label have learned their models.
+/// Prior for the cells of one label, learned by other vehicles.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FleetPrior {
@@ -32,7 +33,7 @@ pub struct FleetPrior {
     pub label: Label,
     /// Number of vehicles.
     pub vehicles: u32,
-    /// Mean cell, with the spread between cells in place of the errors of a fit.
+    /// The mean cell. Its standard deviations describe the differences between cells, not the errors of a fit.
     pub mean: OwnModel,
     /// Covariance of the open-circuit curve between cells (V^2), at the SOC breakpoints of the model.
     pub curve_covariance_v2: Vec<Vec<f64>>,
@@ -41,7 +42,7 @@ pub struct FleetPrior {
 }
 
 impl FleetPrior {
-    /// Combines the models of the vehicles of one label. `None` without vehicles, or if the label has no model.
+    /// Combines the models of the vehicles. Returns `None` without vehicles, or if the label has no model.
     pub fn new(label: &Label, vehicles: &[OwnModel]) -> Option<Self> {
         if vehicles.is_empty() {
             return None;
@@ -81,7 +82,7 @@ impl FleetPrior {
             residual_v: mean_of(&|own| own.residual_v),
         };
         let own = mean.spread_within_pack();
-        // The other spreads shrink as far as the spread of the voltage drop has shrunk.
+        // The other spreads shrink by the same factor as the spread of the voltage drop.
         let share = (drop_variance[warm].sqrt() / label_spread.log_resistance).min(1.0);
         let spread = ModelSpread {
             log_resistance: drop_variance[warm].sqrt().max(own.log_resistance),
@@ -94,14 +95,12 @@ impl FleetPrior {
         Some(Self { label: *label, vehicles, mean, curve_covariance_v2: rows, spread })
     }
 
-    /// Mean and covariance of the open-circuit curves.
     fn curve(label: &CurvePrior, vehicles: &[OwnModel]) -> Option<CurvePrior> {
         let count = vehicles.len() as f64;
         let mut covariance = LABEL_VEHICLES * &label.covariance;
         let mean_v: Vec<f64> =
             (0..SOC_NODES).map(|s| vehicles.iter().map(|own| own.curve_v[s]).sum::<f64>() / count).collect();
         for own in vehicles {
-            // Share of the label's variance that the vehicle's data left.
             let share = |s: usize| {
                 let modes: f64 = own.modes_v.iter().map(|mode_v| mode_v[s] * mode_v[s]).sum();
                 ((modes + own.rest_v[s] * own.rest_v[s]) / label.covariance[(s, s)]).min(1.0)
@@ -112,12 +111,12 @@ impl FleetPrior {
                 unseen + (own.curve_v[a] - mean_v[a]) * (own.curve_v[b] - mean_v[b])
             });
         }
-        // Rounding must not make it asymmetric.
+        // The mean with the transpose removes asymmetry from rounding.
         let covariance = (&covariance + covariance.transpose()) / (2.0 * (count + LABEL_VEHICLES));
         Some(CurvePrior { soc: SOC.to_vec(), mean_v, covariance, electrodes: label.electrodes })
     }
 
-    /// What is known about the next cell of this label; `None` if the label has no model.
+    /// Prior for the next cell of this label; `None` if the label has no model.
     pub fn prior(&self) -> Option<LabelPrior> {
         let of_label = self.label.prior()?;
         let capacity = self.mean.capacity;
@@ -131,7 +130,6 @@ impl FleetPrior {
         })
     }
 
-    /// Covariance of the curve (V^2).
     fn covariance(&self) -> DMatrix<f64> {
         DMatrix::from_fn(SOC_NODES, SOC_NODES, |a, b| self.curve_covariance_v2[a][b])
     }

@@ -1,16 +1,17 @@
 //! Computes the loss modes of an aged cell from its capacity: loss of lithium inventory (LLI) and loss of active
 //! material of each electrode (LAM).
 //!
-//! In: the learned capacity (Ah) and the table of lithium inventories of [`super::aged_ocv`]. Out: losses as fractions
-//! (0 to 1) of the model's new cell, each with its standard deviation. The formulas use d = 1 - C / C_new, the shares
-//! s_n and s_p (material lost per lost capacity in the negative and the positive electrode), and the inventory L(C,
-//! s_n, s_p) of [`super::electrodes`]:
+//! In: the learned capacity C (Ah) and the lithium inventories of [`super::aged_ocv`]. Out: losses as fractions (0 to
+//! 1) of the model's new cell, each with its standard deviation.
 //!
 //! LAM_NE = s_n d,  LAM_PE = s_p d,  LLI = 1 - L(C, s_n, s_p) / L(C_new, 0, 0)
 //!
-//! The capacity, s_n and s_p are independent; the standard deviations include the products of their errors. The split
-//! between material and lithium is an assumption ([`MATERIAL_SHARE`], standard deviation [`MATERIAL_SHARE_STD`]); the
-//! total is learned.
+//! d = 1 - C / C_new is the lost capacity. s_n and s_p are the shares of lost material per lost capacity in the
+//! negative and the positive electrode. L is the inventory of [`super::electrodes`].
+//!
+//! C, s_n and s_p are independent. The standard deviations include the products of their errors. The total loss is
+//! learned, but its split between material and lithium is an assumption ([`MATERIAL_SHARE`] with
+//! [`MATERIAL_SHARE_STD`]).
 //!
 //! Source: Birkl et al., J. Power Sources 341 (2017) 373 (modes and their names).
 //!
@@ -20,14 +21,14 @@
 use super::aged_ocv::{AgedOcv, LithiumLoss, MATERIAL_SHARE, MATERIAL_SHARE_STD};
 use crate::filter::ScalarGaussian;
 
-/// Losses of a cell, fractions of the model's new cell.
+/// Losses of a cell, as fractions of the model's new cell.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LossModes {
-    /// Loss of lithium inventory, LLI.
+    /// Loss of lithium inventory (LLI).
     pub lithium: ScalarGaussian,
-    /// Loss of active material of the negative electrode, LAM_NE.
+    /// Loss of active material of the negative electrode (LAM_NE).
     pub negative: ScalarGaussian,
-    /// Loss of active material of the positive electrode, LAM_PE.
+    /// Loss of active material of the positive electrode (LAM_PE).
     pub positive: ScalarGaussian,
 }
 
@@ -47,7 +48,6 @@ impl LossModes {
             mean: MATERIAL_SHARE * part,
             variance: (MATERIAL_SHARE * MATERIAL_SHARE + share_variance) * part_variance + share_variance * part * part,
         };
-        // A loss is a fraction between 0 and 1.
         let lithium = ScalarGaussian { mean: lithium.mean.clamp(0.0, 1.0), ..lithium };
         Some(Self { lithium, negative: material, positive: material })
     }
@@ -72,7 +72,7 @@ mod tests {
     }
 
     /// Lithium lost by an LG M50 cell that has kept the fraction `part` of its capacity, computed without the table.
-    /// `negative`, `positive`: material lost per lost capacity.
+    /// `negative` and `positive` are the shares of lost material per lost capacity.
     fn lithium(part: f64, negative: f64, positive: f64) -> f64 {
         let lost = LostMaterial { negative: negative * (1.0 - part), positive: positive * (1.0 - part) };
         M50.aged(lost, part).expect("such a cell").lithium_lost()
@@ -92,8 +92,7 @@ mod tests {
     }
 
     /// Simulated lives of an LG M50 cell (PyBaMM 26.10, OKane2022): remaining capacity, LLI, LAM_NE, LAM_PE. In the
-    /// first five lives, the cell loses lithium to the SEI and material by stress; in the last life, it loses only
-    /// lithium.
+    /// last life, the cell loses only lithium. In the other lives, it also loses material by stress.
     const SIMULATED: [[f64; 4]; 6] = [
         [0.9365, 0.0496, 0.0214, 0.0100],
         [0.8723, 0.0985, 0.0440, 0.0233],

@@ -1,8 +1,8 @@
-//! One cell: circuit, thermal model and the filter that estimates its state.
+//! Models one cell: equivalent circuit, thermal model, and the filter that estimates the cell's state.
 //!
-//! In: a checked cell model, settings and one [`CellStep`] per voltage reading (V, A with positive = discharge, s,
-//! degrees C). Out: SOC, resistance ratio and capacity (Ah), each with its standard deviation, and branch voltages (V).
-//! Readings beyond the gate (outliers) do not correct an estimate.
+//! In: a checked cell model, settings, and one [`CellStep`] per voltage reading (V, A, s, degrees C). A positive
+//! current is a discharge. Out: SOC, resistance ratio and capacity (Ah) with standard deviations, and branch voltages
+//! (V). The filter does not correct its estimates with outliers (voltages beyond its gate).
 
 pub mod aged_ocv;
 pub mod chemistry;

@@ -1,15 +1,15 @@
-//! Equivalent-circuit model of one cell type: OCV, R0 and 1 to 3 RC branches over SOC x temperature.
+//! Equivalent-circuit model of one cell type: OCV, R0 and 1 to 3 RC branches over SOC and temperature.
 //!
-//! All values are interpolated linearly over SOC. Over temperature, the OCV and the time constants are interpolated
-//! linearly. Resistances follow an Arrhenius law with [`ACTIVATION_ENERGY_J_PER_MOL`] that passes through the values at
-//! both breakpoints; linear interpolation would be up to 15 % too high in the middle of a 20 K interval. Outside the
-//! temperatures of the grid, the value at the edge is used. Outside SOC 0 to 1, resistances keep the value at the edge.
-//! The OCV continues with the slope of its last interval, so that the filter still corrects a wrong SOC below 0 or
-//! above 1.
+//! All values are interpolated linearly over SOC. OCV and time constants are also interpolated linearly over
+//! temperature. Resistances follow an Arrhenius law with [`ACTIVATION_ENERGY_J_PER_MOL`] that passes through the values
+//! at both breakpoints. Linear interpolation would be up to 15 % too high in the middle of a 20 K interval.
 //!
-//! Deviation: the paper interpolates R1 and C1 separately; this model interpolates their product, the time constant.
-//! Reason: between nodes with different resistances, the product of the two interpolated values is up to twice the
-//! product at either node. Effect: none where R1 and C1 are constant.
+//! Outside the grid, the value at the edge is used, except for the OCV below SOC 0 and above SOC 1. There, the OCV
+//! continues with the slope of its last interval, so that the filter still corrects a wrong SOC.
+//!
+//! Deviation: the paper ("Battery Predictions for Electronic Prognostics") interpolates R1 and C1 separately. This
+//! model interpolates their product, the time constant. Reason: between nodes with different resistances, the product
+//! of the two interpolated values is up to twice the product at either node. Effect: none where R1 and C1 are constant.
 
 use serde::{Deserialize, Serialize};
 
@@ -20,21 +20,21 @@ use crate::filter::{ScalarGaussian, crossing, interpolation, locate};
 /// Maximum number of RC branches.
 pub const MAX_BRANCHES: usize = 3;
 
-/// Activation energy of the resistances between two temperature breakpoints, J/mol. Measured cells have 15 to 35
+/// Activation energy of the resistances between two temperature breakpoints (J/mol). Measured cells have 15 to 35
 /// kJ/mol.
 pub const ACTIVATION_ENERGY_J_PER_MOL: f64 = 25_000.0;
 
 /// Resistance at a temperature, relative to the resistance at 25 degrees C.
 pub fn arrhenius(temperature_c: f64) -> f64 {
     let per_kelvin = 1.0 / (temperature_c + 273.15) - 1.0 / (25.0 + 273.15);
-    // Divided by the gas constant, J/(mol K) (CODATA 2018).
+    // The gas constant is in J/(mol K) (CODATA 2018).
     libm::exp(ACTIVATION_ENERGY_J_PER_MOL / 8.314_462_618 * per_kelvin)
 }
 
 /// One table over SOC (columns) x temperature (rows).
 #[derive(Debug, Clone, PartialEq)]
 pub struct Table {
-    /// `values[t][s]`, row per temperature breakpoint, column per SOC breakpoint.
+    /// `values[t][s]`: one row per temperature breakpoint, one column per SOC breakpoint.
     pub values: Vec<Vec<f64>>,
 }
 
@@ -43,7 +43,7 @@ pub struct Table {
 pub struct Branch {
     /// Resistance (ohm).
     pub r_ohm: Table,
-    /// Capacitance, farad.
+    /// Capacitance (F).
     pub c_farad: Table,
 }
 
@@ -52,25 +52,25 @@ pub struct Branch {
 pub struct Thermal {
     /// Heat capacity (J/K).
     pub heat_capacity_j_per_k: f64,
-    /// Thermal resistance to the surroundings, K/W.
+    /// Thermal resistance to the surroundings (K/W).
     pub resistance_k_per_w: f64,
 }
 
-/// A checked cell model: breakpoints and OCV rise strictly, all resistances and capacitances are positive and finite,
-/// and the tables are complete. Created by `config::cell_model` from a file, or by `cell::chemistry` from a label.
+/// A checked cell model. Breakpoints and OCV rise strictly, all resistances and capacitances are positive and finite,
+/// and the tables are complete. `config::cell_model` creates it from a file, `cell::chemistry` from a label.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CellModel {
     /// Display name.
     pub name: String,
-    /// Capacity on the label (Ah). The SOH is relative to this capacity.
+    /// Capacity on the label (Ah), to which the SOH is relative.
     pub rated_capacity_ah: f64,
-    /// Capacity of a new cell between its full and its empty open-circuit voltage at the reference temperature (Ah).
+    /// Capacity of a new cell between full and empty open-circuit voltage at the reference temperature (Ah).
     pub capacity_ah: f64,
     /// Lowest voltage under load (V).
     pub voltage_min_v: f64,
     /// Highest voltage under charge (V).
     pub voltage_max_v: f64,
-    /// SOC breakpoints, fraction, first 0, last 1.
+    /// SOC breakpoints (fraction) from 0 to 1.
     pub soc: Vec<f64>,
     /// Temperature breakpoints (degrees C).
     pub temperature_c: Vec<f64>,
@@ -80,18 +80,18 @@ pub struct CellModel {
     pub aged_ocv: AgedOcv,
     /// Series resistance (ohm).
     pub r0_ohm: Table,
-    /// RC branches, 1 to [`MAX_BRANCHES`].
+    /// One to [`MAX_BRANCHES`] RC branches.
     pub branches: Vec<Branch>,
-    /// Standard deviation of the model's voltage error, averaged over [`ERROR_WINDOW_S`], V; `None` = unknown.
+    /// Standard deviation of the model's voltage error, averaged over [`ERROR_WINDOW_S`] (V); `None` = unknown.
     pub voltage_error_v: Option<Table>,
-    /// Thermal parameters; `None` = no estimate of a missing temperature.
+    /// Thermal parameters; `None` = a missing temperature is not estimated.
     pub thermal: Option<Thermal>,
-    /// Spread of the cells around the model; `None` = the usual spread of cells of one type.
+    /// Differences between the cells and the model; `None` = the usual differences within one cell type.
     pub spread: Option<ModelSpread>,
 }
 
-/// Standard deviations of the properties of cells around their model. The modes in which the open-circuit curve varies
-/// between cells are stored with the mixes of losses ([`AgedOcv::add_spread`]).
+/// Standard deviations of the differences between cells and their model. The modes of the open-circuit curve are stored
+/// separately ([`AgedOcv::add_spread`]).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ModelSpread {
@@ -99,17 +99,17 @@ pub struct ModelSpread {
     pub curve_v: f64,
     /// ln(resistance relative to the model).
     pub log_resistance: f64,
-    /// Resistance of the slowest branch relative to the others, fraction.
+    /// Resistance of the slowest branch relative to the others (fraction).
     pub slow_branch: f64,
-    /// Capacity, fraction.
+    /// Capacity (fraction).
     pub capacity: f64,
-    /// Error of the present voltage drop and of the voltage drop caused by the load of the last minutes: fraction of
-    /// the drop, for an average over one second.
+    /// Error of the voltage drop that is caused by the present load and by the load of the last minutes. It is a
+    /// fraction of the drop, for an average over one second.
     pub drop_sqrt_s: f64,
 }
 
 impl ModelSpread {
-    /// Spread of cells of the model's own type. `curve_v`: standard deviation of the open-circuit curve's error (V).
+    /// Usual differences within one cell type. `curve_v`: standard deviation of the open-circuit curve's error (V).
     pub fn usual(branches: usize, curve_v: f64) -> Self {
         let slow_branch = if branches > 1 { 0.2 } else { 0.1 };
         Self { curve_v, log_resistance: 0.2, slow_branch, capacity: 0.1, drop_sqrt_s: 0.0 }
@@ -119,10 +119,9 @@ impl ModelSpread {
 /// Time over which [`CellModel::voltage_error_v`] is averaged (s).
 pub const ERROR_WINDOW_S: f64 = 100.0;
 
-/// Position of a temperature in the grid, for every SOC.
+/// Position of a temperature in the grid.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TemperaturePosition {
-    /// Index of the lower temperature.
     pub(super) t: usize,
     /// Weight of the upper temperature row, in [0, 1].
     pub(super) along_t: f64,
@@ -130,19 +129,18 @@ pub struct TemperaturePosition {
     pub(super) along_arrhenius: f64,
 }
 
-/// The four grid corners around one (SOC, temperature) and their weights, for every table.
+/// The four grid corners around one SOC and temperature, with their weights.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GridPosition {
     s: usize,
-    /// Weight of the upper SOC column, in [0, 1].
     along_s: f64,
-    /// The weight of the upper SOC column without limits, because the OCV continues below SOC 0 and above SOC 1.
+    /// Like `along_s`, but without limits, because the OCV continues below SOC 0 and above SOC 1.
     beyond_s: f64,
     temperature: TemperaturePosition,
 }
 
 impl TemperaturePosition {
-    /// Interpolates `value` between the lower and the upper row with weight `along`. At weight 0, does not read the
+    /// Interpolates `value` between the lower and the upper row with weight `along`. With weight 0, does not read the
     /// upper row.
     fn between(&self, along: f64, value: impl Fn(usize) -> f64) -> f64 {
         let low = value(self.t);
@@ -156,17 +154,16 @@ impl Table {
     }
 }
 
-/// If the mean slope of the open-circuit curve is below this value (V per unit of SOC), an electrode is a mixture of
-/// two phases.
+/// Mean slope of the open-circuit curve (V per unit of SOC) below which an electrode counts as a mixture of two phases.
 const TWO_PHASE_SLOPE_V: f64 = 0.15;
 
-/// Hysteresis of a two-phase electrode: standard deviation of the voltage around the middle between the charge curve
-/// and the discharge curve (V). For LFP, the two curves are 10 to 25 mV apart.
+/// Hysteresis of a two-phase electrode: standard deviation of the voltage (V) around the middle between charge curve
+/// and discharge curve. For LFP, the two curves are 10 to 25 mV apart.
 const TWO_PHASE_HYSTERESIS_V: f64 = 0.01;
 
 impl CellModel {
-    /// Spread of the cells around the model. If the model states no spread: the usual spread of cells of one type. If
-    /// the curve is flat, this usual spread includes the hysteresis of a two-phase electrode.
+    /// Differences between the cells and the model. If the model states no differences, returns the usual ones of one
+    /// cell type. For a flat curve, these include the hysteresis of a two-phase electrode.
     pub fn spread(&self) -> ModelSpread {
         self.spread.unwrap_or_else(|| {
             let curve_v = if self.is_two_phase() { TWO_PHASE_HYSTERESIS_V } else { 0.0 };
@@ -174,8 +171,7 @@ impl CellModel {
         })
     }
 
-    /// Whether the curve between 20 and 80 % is flat. A model that has not been checked may have incomplete tables; it
-    /// counts as steep.
+    /// Whether the curve between 20 and 80 % SOC is flat. An unchecked model with incomplete tables counts as steep.
     fn is_two_phase(&self) -> bool {
         let curve = self.ocv_v.values.first();
         let node = |at: f64| {
@@ -187,12 +183,12 @@ impl CellModel {
         })
     }
 
-    /// Grid position of a SOC and a temperature.
+    /// Grid position of a SOC and a temperature (degrees C).
     pub fn grid_position(&self, soc: f64, temperature_c: f64) -> GridPosition {
         self.grid_position_at(&self.temperature_position(temperature_c), soc)
     }
 
-    /// Grid position of a temperature.
+    /// Grid position of a temperature (degrees C).
     pub fn temperature_position(&self, temperature_c: f64) -> TemperaturePosition {
         let (t, along_t) = match self.temperature_c.len() {
             1 => (0, 0.0),
@@ -219,13 +215,13 @@ impl CellModel {
         self.ocv_v.at(position, position.beyond_s, position.temperature.along_t)
     }
 
-    /// Open-circuit voltage of a cell aged to a capacity (V).
+    /// Open-circuit voltage (V) of a cell with this capacity (Ah).
     pub fn aged_ocv_v(&self, position: &GridPosition, capacity_ah: f64) -> f64 {
         self.ocv_v(position) + self.offset(position, capacity_ah).offset_v.at(self.soc_at(position))
     }
 
-    /// Change of the aged open-circuit voltage per Ah of capacity (V) and per standard deviation of each mix of losses,
-    /// V.
+    /// Changes of the aged open-circuit voltage: per Ah of capacity (V/Ah), and by each mix of losses
+    /// ([`super::aged_ocv`], V).
     pub fn aged_ocv_changes_v(&self, position: &GridPosition, capacity_ah: f64) -> (f64, [f64; MIXES]) {
         let (line, soc) = (self.offset(position, capacity_ah), self.soc_at(position));
         (line.per_ah_v.at(soc), line.mixes_v.map(|mix_v| mix_v.at(soc)))
@@ -236,7 +232,7 @@ impl CellModel {
         from + position.beyond_s * (to - from)
     }
 
-    /// Slope of the open-circuit voltage of an aged cell over SOC (V per unit of SOC).
+    /// Slope of the open-circuit voltage of an aged cell (V per unit of SOC).
     pub fn ocv_slope_v(&self, position: &GridPosition, capacity_ah: f64) -> f64 {
         let rise = |t: usize| self.ocv_v.values[t][position.s + 1] - self.ocv_v.values[t][position.s];
         position.temperature.between(position.temperature.along_t, rise)
@@ -244,8 +240,7 @@ impl CellModel {
             + self.offset(position, capacity_ah).offset_v.0[1]
     }
 
-    /// Returns a model in which a cell aged to this capacity (Ah) counts as new: the aged curve becomes the new cell's
-    /// curve. Further ageing follows the same law.
+    /// Returns a model in which a cell with this capacity (Ah) counts as new. Further ageing follows the same law.
     pub fn rebased(&self, capacity_ah: f64) -> Self {
         let last = self.soc.len() - 2;
         let offset_v = |s: usize| self.aged_ocv.line(&self.soc, s.min(last), capacity_ah).offset_v.at(self.soc[s]);
@@ -268,7 +263,7 @@ impl CellModel {
         self.aged_ocv.line(&self.soc, position.s, capacity_ah)
     }
 
-    /// Losses of a cell of this capacity (Ah); `None` if unknown for this cell type.
+    /// Losses of a cell with this capacity (Ah); `None` if unknown for this cell type.
     pub fn loss_modes(&self, capacity: ScalarGaussian) -> Option<LossModes> {
         LossModes::of_capacity(&self.aged_ocv, self.capacity_ah, capacity)
     }
@@ -294,7 +289,7 @@ impl CellModel {
         position.temperature.between(position.temperature.along_t, row_tau_s)
     }
 
-    /// Standard deviation of the model's voltage error, averaged over [`ERROR_WINDOW_S`], V; `None` = unknown.
+    /// Standard deviation of the model's voltage error, averaged over [`ERROR_WINDOW_S`] (V); `None` = unknown.
     pub fn voltage_error_v(&self, position: &GridPosition) -> Option<f64> {
         Some(self.voltage_error_v.as_ref()?.at(position, position.along_s, position.temperature.along_t))
     }
@@ -304,13 +299,12 @@ impl CellModel {
         (0..self.branches.len()).fold(self.r0_ohm(position), |sum, i| sum + self.branch_r_ohm(i, position))
     }
 
-    /// SOC of a new cell at an open-circuit voltage, found by bisection between -0.5 and 1.5. If the SOC is outside
-    /// this range, returns the nearer end.
+    /// SOC of a new cell at an open-circuit voltage, limited to -0.5 to 1.5.
     pub fn soc_of_ocv(&self, voltage_v: f64, temperature_c: f64) -> f64 {
         self.soc_of_aged_ocv(&self.temperature_position(temperature_c), self.capacity_ah, voltage_v)
     }
 
-    /// SOC of a cell aged to a capacity at an open-circuit voltage; see [`Self::soc_of_ocv`].
+    /// SOC of a cell with this capacity (Ah) at an open-circuit voltage, limited to -0.5 to 1.5.
     pub fn soc_of_aged_ocv(&self, temperature: &TemperaturePosition, capacity_ah: f64, voltage_v: f64) -> f64 {
         let is_below = |soc| voltage_v > self.aged_ocv_v(&self.grid_position_at(temperature, soc), capacity_ah);
         crossing((-0.5, 1.5), is_below)

@@ -1,16 +1,16 @@
-//! Uncertainty of a cell model: bands of its open-circuit curve and resistances, and the resulting SOC errors.
+//! Computes the uncertainty of a cell model: bands of its open-circuit curve and resistances, and the resulting SOC
+//! errors.
 //!
-//! In: a [`CellModel`]. Out: standard deviations of a cell's voltage (V), resistance (fraction) and SOC around the
-//! model. If the model states no error of its curve, voltage and SOC have `None`. The estimator starts with the same
+//! In: a [`CellModel`]. Out: standard deviations of a cell's voltage (V), ln(resistance) and SOC (fraction) around the
+//! model. If the model states no error of its curve, voltage and SOC are `None`. The estimator starts with the same
 //! standard deviations.
 //!
-//! * Curve: the modes of the spread between cells, and the smallest `voltage_error_v` of all temperatures at this SOC.
-//!   At the temperature with the smallest error, the resistances matter least, so this error is mostly an error of the
-//!   curve. If the model has no such table, the constant error of the spread is used.
-//! * Resistances: a common error (`log_resistance` of the spread; if the model states no spread, the usual value for
-//!   cells of one type), and an error that differs between SOC and temperatures. The second error has two parts: the
-//!   standard deviation of the voltage drop over [`ERROR_WINDOW_S`], and the part of `voltage_error_v` beyond the
-//!   curve's error. Both are relative to the drop at a usual load.
+//! * Curve: the modes of the differences between cells, and the smallest `voltage_error_v` of all temperatures at this
+//!   SOC. At the temperature with the smallest error, the resistances matter least, so this error is mostly an error of
+//!   the curve. Without such a table, the constant error of the spread is used.
+//! * Resistances: a common error (`log_resistance` of the spread) and a local error that differs between SOC and
+//!   temperatures. The local error has two parts: the standard deviation of the voltage drop over [`ERROR_WINDOW_S`],
+//!   and the part of `voltage_error_v` beyond the curve's error. Both are relative to the drop at a usual load.
 
 mod advice;
 
@@ -20,7 +20,7 @@ use super::chemistry::USUAL_LOAD_PER_H;
 use super::model::{CellModel, ERROR_WINDOW_S, GridPosition, ModelSpread};
 use crate::filter::square;
 
-/// Temperature of a displayed curve (degrees C). If it is outside the table, the nearest breakpoint is used.
+/// Temperature of a displayed curve (degrees C). Outside the table, the nearest breakpoint is used.
 pub const CURVE_C: f64 = 25.0;
 
 /// Variance of an unknown SOC: uniform over 0 to 1.
@@ -29,14 +29,14 @@ const EVEN_VARIANCE: f64 = 1.0 / 12.0;
 /// Standard deviation of ln(resistance).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ResistanceBand {
-    /// Common to all SOC and temperatures.
+    /// The same at every SOC and temperature.
     pub common: f64,
     /// Specific to this SOC and temperature.
     pub local: f64,
 }
 
 impl ResistanceBand {
-    /// Total.
+    /// Common and local standard deviation together.
     pub fn std(&self) -> f64 {
         self.common.hypot(self.local)
     }
@@ -54,13 +54,13 @@ impl<'a> ModelBands<'a> {
         Self { model }
     }
 
-    /// Open-circuit voltage at [`CURVE_C`], V.
+    /// Open-circuit voltage at [`CURVE_C`] (V).
     pub fn ocv_v(&self, soc: f64) -> f64 {
         self.model.ocv_v(&self.at(soc))
     }
 
-    /// Slope of the open-circuit voltage at [`CURVE_C`], V per unit of SOC, over 5 % of SOC (the resolution of a
-    /// filter).
+    /// Slope of the open-circuit voltage at [`CURVE_C`] (V per unit of SOC), over 5 % of SOC, which is the resolution
+    /// of a filter.
     pub fn slope_v(&self, soc: f64) -> f64 {
         let (low, high) = ((soc - 0.025).max(0.0), (soc + 0.025).min(1.0));
         (self.ocv_v(high) - self.ocv_v(low)) / (high - low)
@@ -72,14 +72,13 @@ impl<'a> ModelBands<'a> {
         Some(self.curve_rest_v(soc)?.hypot(a).hypot(b))
     }
 
-    /// Modes of the spread between cells (V) per standard deviation.
     pub(super) fn modes_v(&self, soc: f64) -> [f64; 2] {
         let has_spread = self.model.spread.is_some();
         let modes_v = self.model.aged_ocv_changes_v(&self.at(soc), self.model.capacity_ah).1;
         if has_spread { modes_v } else { [0.0; 2] }
     }
 
-    /// Standard deviation of the curve without the modes (V).
+    /// Standard deviation of the curve (V) without the modes.
     pub(super) fn curve_rest_v(&self, soc: f64) -> Option<f64> {
         let of_row = |t: &f64| self.model.voltage_error_v(&self.model.grid_position(soc, *t));
         let least = self.model.temperature_c.iter().filter_map(of_row).reduce(f64::min);
@@ -99,7 +98,7 @@ impl<'a> ModelBands<'a> {
         ResistanceBand { common: spread.log_resistance, local }
     }
 
-    /// Standard deviation of the capacity, fraction.
+    /// Standard deviation of the capacity (fraction).
     pub fn capacity_std(&self) -> f64 {
         self.spread().capacity
     }
@@ -108,19 +107,18 @@ impl<'a> ModelBands<'a> {
         self.model.spread()
     }
 
-    /// Standard deviation of the SOC from one voltage at rest, fraction.
+    /// Standard deviation of the SOC (fraction) from one voltage at rest.
     pub fn rest_soc_std(&self, soc: f64) -> Option<f64> {
         Some(soc_variance(square(self.curve_std_v(soc)?), self.slope_v(soc), EVEN_VARIANCE).sqrt())
     }
 
-    /// Standard deviation of the SOC from one voltage under a usual load, C/2, fraction.
+    /// Standard deviation of the SOC (fraction) from one voltage under a usual load (C/2).
     pub fn load_soc_std(&self, soc: f64, temperature_c: f64) -> Option<f64> {
         let drop_v = self.usual_drop_v(&self.model.grid_position(soc, temperature_c));
         let error_v = self.curve_std_v(soc)?.hypot(self.resistance(soc, temperature_c).std() * drop_v);
         Some(soc_variance(square(error_v), self.slope_v(soc), EVEN_VARIANCE).sqrt())
     }
 
-    /// Voltage drop of a usual load after all branches have settled (V).
     pub(super) fn usual_drop_v(&self, position: &GridPosition) -> f64 {
         USUAL_LOAD_PER_H * self.model.rated_capacity_ah * self.model.settled_ohm(position)
     }
@@ -130,8 +128,8 @@ impl<'a> ModelBands<'a> {
     }
 }
 
-/// Variance of the SOC after a voltage reading. `before`: variance of the SOC before the reading; `voltage_variance`:
-/// variance of the voltage (V^2); `slope_v`: slope of the curve (V per unit of SOC).
+/// Variance of the SOC after a voltage reading. `before`: the variance before the reading. `voltage_variance`: variance
+/// of the voltage (V^2). `slope_v`: slope of the curve (V per unit of SOC).
 fn soc_variance(voltage_variance: f64, slope_v: f64, before: f64) -> f64 {
     1.0 / (slope_v * slope_v / voltage_variance + 1.0 / before)
 }

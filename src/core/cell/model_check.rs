@@ -2,24 +2,23 @@
 //!
 //! In: innovations (V) with their variances (V^2), SOC and the learned resistance, every 10 s of use. Out: after 10
 //! minutes of use, [`ModelCheck::mismatch`], which is above 1 if the model belongs to another cell. Readings at rest,
-//! after a gap, without an update or outside the innovation gate do not count as evidence.
+//! after a gap, without an update or outside the innovation gate do not count.
 //!
-//! A filter with a wrong model hides the error from its innovations, because it corrects first the resistance and then
-//! the SOC. Two kinds of evidence (witnesses) remain:
-//! * r^2, the square of ln(resistance relative to new) divided by its configured standard deviation;
-//! * c^2 = g' (A + P^-1)^-1 g, the part of the innovations v that a constant a and a slope b over SOC explain (the
-//!   score test; Cox and Hinkley, Theoretical Statistics, 1974, section 9.3). A and g are the sums of `h h' / R` and `h
-//!   v / R` with h = (1, SOC - 0.5). R is the variance over the time that a reading represents. P contains the
-//!   variances that a and b have between chemistries.
+//! A filter with a wrong model corrects first the resistance and then the SOC, which hides the error from its
+//! innovations. Two kinds of evidence remain:
+//! * r^2, the square of ln(resistance relative to a new cell) divided by its configured standard deviation.
+//! * c^2 = g' (A + P^-1)^-1 g, the part of the innovations v that a constant a and a slope b over SOC explain (score
+//!   test; Cox and Hinkley, Theoretical Statistics, 1974, section 9.3). A and g are the sums of `h h' / R` and `h v /
+//!   R` with h = (1, SOC - 0.5). R is the variance over the time that a reading represents. P contains the variances of
+//!   a and b between chemistries.
 //!
-//! In the sum of the witnesses, each witness counts at most [`CORROBORATED`] times as much as the other witness. The
-//! reason is that other causes affect only one witness: an aged cell has a higher resistance, but the voltages fit; a
-//! local error of a cell's own curve does not change the resistance. With another cell's model, both witnesses are
-//! large.
+//! In the sum of both, each kind counts at most [`CORROBORATED`] times as much as the other kind, because other causes
+//! affect only one of them. An aged cell has a higher resistance, but its voltages fit. A local error of a cell's own
+//! curve does not change the resistance. With another cell's model, both are large.
 //!
-//! The check ends after [`WINDOW_S`] without a mismatch, because a cell ages but does not become another cell. After a
-//! mismatch, the following windows are judged one by one until one window has no mismatch. An aged cell is thus trusted
-//! again after its capacity and resistance have been learned.
+//! The check ends after [`WINDOW_S`] without a mismatch, because a cell does not become another cell. After a mismatch,
+//! the following windows are judged until a window has no mismatch. An aged cell is thus trusted again after its
+//! capacity and resistance have been learned.
 
 use serde::{Deserialize, Serialize};
 
@@ -28,18 +27,16 @@ use crate::filter::square;
 use crate::quantity::InvalidState;
 
 /// Duration of use in a window (s). On drives from -10 to 40 degrees C, half of this time suffices to recognise another
-/// cell; in a longer window, the cell would age.
+/// cell. In a longer window, the cell would age.
 const WINDOW_S: f64 = 3600.0;
 
-/// Standard deviations of the voltage difference to another cell's curve: of the constant (V), and of the slope (V per
-/// unit of SOC).
+/// Standard deviations of the difference to another cell's curve: constant (V), and slope (V per unit of SOC).
 const CURVE_STD_V: [f64; 2] = [0.2, 0.4];
 
-/// A witness counts at most this many times as much as the other witness.
+/// Each kind of evidence counts at most this many times as much as the other kind.
 const CORROBORATED: f64 = 4.0;
 
-/// Minimum sum of the witnesses that counts as a mismatch: three parts (constant, slope, resistance) of 1.4 standard
-/// deviations each.
+/// Minimum evidence of a mismatch: three parts (constant, slope, resistance) of 1.4 standard deviations each.
 const LIMIT: f64 = 6.0;
 
 /// Evidence about one cell's model.
@@ -47,32 +44,31 @@ const LIMIT: f64 = 6.0;
 pub struct ModelCheck {
     /// The checked model ([`model_id`]); 0 = no check.
     model: u64,
-    /// Time of use judged so far (s).
     use_s: f64,
-    /// Time (s) and charge (A s) since the last evidence was taken.
+    /// Time (s) and charge (A s) since evidence was last taken.
     since_s: f64,
     since_as: f64,
-    /// Duration of the latest step (s).
     step_s: f64,
     voltages: VoltageSums,
-    /// Maximum sum of the witnesses in this window, divided by [`LIMIT`].
+    /// Maximum evidence in this window, divided by [`LIMIT`].
     mismatch: f64,
-    /// `mismatch` of the previous window if it exceeded 1, else 0.
+    /// `mismatch` of the previous window if it was above 1, else 0.
     before: f64,
 }
 
 /// Sums over the readings of a window, relative to the mean SOC of the readings. While the SOC hardly changes, sums
-/// relative to a fixed SOC would give small differences of large numbers, and the store rounds numbers.
+/// relative to a fixed SOC would be small differences of large numbers. The store rounds numbers, so the differences
+/// would be lost.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(from = "[f64; 5]", into = "[f64; 5]")]
 struct VoltageSums {
-    /// Sum of 1 / R, V^-2.
+    /// Sum of 1 / R (V^-2).
     weight: f64,
     /// Mean SOC, weighted by 1 / R.
     mean_soc: f64,
-    /// Sum of (SOC - mean)^2 / R, V^-2.
+    /// Sum of (SOC - mean)^2 / R (V^-2).
     spread: f64,
-    /// Sums of v / R and (SOC - mean) v / R, V^-1.
+    /// Sums of v / R and (SOC - mean) v / R (V^-1).
     score: [f64; 2],
 }
 
@@ -89,7 +85,6 @@ impl From<VoltageSums> for [f64; 5] {
 }
 
 impl VoltageSums {
-    /// Adds an innovation (V) with its variance (V^2).
     fn add(&mut self, soc: f64, innovation: f64, variance: f64) {
         let weight = 1.0 / variance;
         let before = self.mean_soc;
@@ -101,8 +96,7 @@ impl VoltageSums {
         self.score[0] += weight * innovation;
     }
 
-    /// c^2, the part of the innovations that a constant and a slope over SOC explain. Products that cancel in the
-    /// formula of the module header are left out, so no term is negative.
+    /// c^2 of the module header. Products that cancel are left out, so no term is negative.
     fn explained(&self) -> f64 {
         let Self { weight, mean_soc, spread, score: [constant, slope] } = *self;
         let [prior_constant, prior_slope] = CURVE_STD_V.map(|std| 1.0 / square(std));
@@ -126,15 +120,15 @@ impl VoltageSums {
 pub struct ModelEvidence {
     /// The latest update.
     pub update: Update,
-    /// State of charge after the update, fraction.
+    /// State of charge after the update (fraction).
     pub soc: f64,
-    /// ln(resistance relative to new).
+    /// ln(resistance relative to a new cell).
     pub log_resistance: f64,
     /// Configured standard deviation of `log_resistance` before the first voltage.
     pub log_resistance_std: f64,
 }
 
-/// Identifies a cell model and the expected spread of resistances: FNV-1a of everything the check depends on.
+/// Identifies a cell model and the expected spread of resistances: FNV-1a of all inputs of the check.
 pub fn model_id(model: &CellModel, log_resistance_std: f64) -> u64 {
     let CellModel { soc, temperature_c, ocv_v, r0_ohm, branches, rated_capacity_ah, .. } = model;
     let text =
@@ -169,8 +163,8 @@ impl ModelCheck {
         self.use_s < WINDOW_S
     }
 
-    /// Adds the time (s) and the charge (A s) of a step. If the step has unmeasured time, discards the time and charge
-    /// since the last evidence.
+    /// Adds the time (s) and the charge (A s) of a step. A step with unmeasured time discards the time and charge since
+    /// the last evidence.
     #[inline]
     pub fn add_step(&mut self, measured_s: f64, charge_as: f64, unmeasured_s: f64) {
         if !self.is_open() {
@@ -188,19 +182,19 @@ impl ModelCheck {
     /// Whether evidence is due.
     #[inline]
     pub fn is_due(&self) -> bool {
-        // Every 10 s: short compared with the 100 s over which the error that a model states is averaged.
+        // 10 s are short compared with the 100 s over which a model's stated error is averaged.
         self.since_s >= 10.0 && self.is_open()
     }
 
-    /// Takes the evidence that is due for a cell of rated capacity `rated_ah` (Ah). `evidence` is `None` if the filter
-    /// cannot provide evidence.
+    /// Takes the evidence that is due for a cell with the rated capacity `rated_ah` (Ah). `evidence` is `None` if the
+    /// filter cannot provide evidence.
     pub fn judge(&mut self, evidence: Option<ModelEvidence>, rated_ah: f64) {
         // One reading represents at most 90 s. Currents below C/50 do not show the resistance.
         let (elapsed_s, charge_as) = (self.since_s.min(90.0), self.since_as);
         let is_used = charge_as.abs() >= 0.02 * rated_ah * self.since_s;
         (self.since_s, self.since_as) = (0.0, 0.0);
         let Some(ModelEvidence { update, soc, log_resistance, log_resistance_std }) = evidence else { return };
-        // The filter's variance applies to one step. Scale it to the time that the reading represents.
+        // The filter's variance applies to one step. It is scaled to the time that the reading represents.
         let variance = update.innovation_variance * (self.step_s / elapsed_s).min(1.0);
         let is_number = (update.innovation / variance).is_finite() && soc.is_finite() && log_resistance.is_finite();
         if !is_used || !update.accepted || !is_number {
@@ -209,10 +203,9 @@ impl ModelCheck {
         self.use_s += elapsed_s;
         self.voltages.add(soc, update.innovation, variance);
         if self.check().is_err() {
-            // Discard sums that cannot be stored.
             *self = Self::new(self.model);
         }
-        // In the first minutes, the filter still settles and a single wrong reading has too much weight.
+        // In the first minutes, the filter still settles, and a single wrong reading has too much weight.
         if self.use_s < 600.0 {
             return;
         }
@@ -227,7 +220,7 @@ impl ModelCheck {
         }
     }
 
-    /// Maximum evidence for another cell in this window and the previous window, relative to the limit.
+    /// Maximum evidence for another cell in this window and the previous window, divided by the limit.
     #[inline]
     pub fn mismatch(&self) -> f64 {
         self.mismatch.max(self.before)
@@ -260,8 +253,8 @@ mod tests {
     use super::*;
     use crate::cell::model::tests::small_model;
 
-    /// Returns the check after a discharge at 1 C from SOC 0.9 for `use_s` seconds, in steps of 1 s. `voltage` returns
-    /// the innovation at a SOC (V).
+    /// Returns the check after a discharge at 1 C from SOC 0.9 for `use_s` seconds. `voltage` returns the innovation
+    /// (V) at a SOC.
     fn after(use_s: u32, ratio: f64, voltage: impl Fn(f64) -> f64) -> ModelCheck {
         let mut check = ModelCheck::default();
         for second in 0..use_s {
@@ -349,7 +342,7 @@ mod tests {
         assert!((sums.explained() / expected - 1.0).abs() < 1e-9, "{} {expected}", sums.explained());
     }
 
-    /// Keeps only 20 bits of the mantissa of each sum, fewer than the store keeps.
+    /// Rounds each sum to 20 bits of the mantissa, which is coarser than the store.
     #[test]
     fn rounded_sums_keep_their_evidence() {
         let mut sums = VoltageSums::default();

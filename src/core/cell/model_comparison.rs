@@ -1,25 +1,22 @@
-//! Compares two cell models: open-circuit curves (V), resistances (fraction), and resulting SOC errors.
+//! Compares two cell models: open-circuit curves (V), resistances (fraction), and resulting SOC errors (fraction).
 //!
-//! In: two [`CellModel`]s. Out: values of the second model minus values of the first. Resistances are multiplied by the
-//! rated capacity before they are compared. The load of each cell is C/2, so cells of different size can be compared.
+//! In: two [`CellModel`]s. Out: values of the second model minus values of the first. So that cells of different size
+//! can be compared, resistances are multiplied by the rated capacity, and the load of each cell is C/2.
 
 use super::chemistry::USUAL_LOAD_PER_H;
 use super::model::CellModel;
 use super::model_bands::CURVE_C;
 
-/// Number of SOC steps over the curve.
 const CURVE_STEPS: u32 = 100;
-/// Number of SOC steps in the table that gives the SOC of a voltage, at rest or under load. Must be a multiple of
-/// `CURVE_STEPS`.
+/// Number of SOC steps in the table that gives the SOC of a voltage; a multiple of `CURVE_STEPS`.
 const READ_STEPS: u32 = 400;
-/// SOC range in which SOC errors count. Outside this range, curves are so steep that the SOC errors of any model are
-/// small.
+/// SOC range in which SOC errors count. Outside, curves are so steep that the SOC errors of any model are small.
 const MIDDLE: (f64, f64) = (0.05, 0.95);
 
 /// A difference at one SOC.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AtSoc {
-    /// SOC, fraction.
+    /// SOC (fraction).
     pub soc: f64,
     /// Value of the second model minus value of the first.
     pub value: f64,
@@ -39,11 +36,11 @@ pub struct Difference {
 pub struct AtTemperature {
     /// Temperature (degrees C).
     pub temperature_c: f64,
-    /// Series resistance times rated capacity, fraction.
+    /// Relative difference (fraction) of series resistance times rated capacity.
     pub series: Difference,
-    /// Resistance with all branches settled, times rated capacity, fraction.
+    /// Relative difference (fraction) of settled resistance (all branches settled) times rated capacity.
     pub settled: Difference,
-    /// SOC read from a voltage under C/2, fraction.
+    /// SOC (fraction) read from a voltage under C/2.
     pub load_soc: Difference,
 }
 
@@ -54,16 +51,15 @@ pub struct ModelComparison {
     pub curve_v: Vec<AtSoc>,
     /// Summary of `curve_v`.
     pub curve: Difference,
-    /// SOC read from a voltage at rest, fraction.
+    /// SOC (fraction) read from a voltage at rest.
     pub rest_soc: Difference,
-    /// Capacity, fraction.
+    /// Relative difference of the capacity (fraction).
     pub capacity: f64,
     /// Resistances and SOC under load, by temperature; empty if the models share no temperature.
     pub temperatures: Vec<AtTemperature>,
 }
 
 impl Difference {
-    /// Summary of values; 0 without values.
     fn of(values: &[AtSoc]) -> Self {
         let squares: f64 = values.iter().map(|at| at.value * at.value).sum();
         let largest = values.iter().copied().max_by(|a, b| a.value.abs().total_cmp(&b.value.abs()));
@@ -97,8 +93,7 @@ fn ocv_v(model: &CellModel, soc: f64) -> f64 {
     model.ocv_v(&model.grid_position(soc, CURVE_C))
 }
 
-/// Whether a temperature is within the tables of a model. A table with a single temperature counts as measured at
-/// [`CURVE_C`].
+/// Whether a temperature is within the tables of a model. A single temperature counts as [`CURVE_C`].
 fn has(model: &CellModel, temperature_c: f64) -> bool {
     match model.temperature_c[..] {
         [_] => temperature_c == CURVE_C,
@@ -125,7 +120,7 @@ fn at_temperature(first: &CellModel, second: &CellModel, temperature_c: f64) -> 
 }
 
 /// SOC that the second model reads from a voltage of the first model, minus the SOC of the first model. All branches
-/// are settled. `load_per_h` is the load current divided by the rated capacity.
+/// are settled. `load_per_h` is the load current divided by the rated capacity (1/h).
 fn soc_difference(first: &CellModel, second: &CellModel, temperature_c: f64, load_per_h: f64) -> Difference {
     let drop_v = |model: &CellModel, soc: f64| {
         load_per_h * model.rated_capacity_ah * model.settled_ohm(&model.grid_position(soc, temperature_c))
@@ -142,9 +137,9 @@ fn soc_difference(first: &CellModel, second: &CellModel, temperature_c: f64, loa
     Difference::of(&middle.collect::<Vec<_>>())
 }
 
-/// Returns the SOC nearest to `soc` at which a model has the voltage. If the model has the voltage at no SOC, returns
-/// the SOC with the nearest voltage. Under load, several SOCs may have the same voltage, because a resistance that
-/// rises with the SOC bends the curve down.
+/// Returns the SOC nearest to `soc` at which a model has the voltage. If no SOC has this voltage, returns the SOC with
+/// the nearest voltage. Under load, several SOCs can have the same voltage, because a resistance that rises with the
+/// SOC bends the curve down.
 fn nearest(places: &[f64], readings_v: &[f64], voltage_v: f64, soc: f64) -> f64 {
     let crossings = places.windows(2).zip(readings_v.windows(2)).filter_map(|(place, reading)| {
         let (low, high) = (reading[0] - voltage_v, reading[1] - voltage_v);
@@ -190,7 +185,7 @@ mod tests {
         second.ocv_v.values.iter_mut().flatten().for_each(|v| *v += 0.012);
         let found = ModelComparison::new(&first, &second);
         assert!((found.curve.rms - 0.012).abs() < 1e-12 && (found.curve.worst.value - 0.012).abs() < 1e-12);
-        // 12 mV on slopes of 1.325 and 1.075 V per unit of SOC at 25 degrees C: the second model reads the SOC too low.
+        // At 25 degrees C, the slopes are 1.325 and 1.075 V per unit of SOC. The second model reads the SOC too low.
         let worst = found.rest_soc.worst.value;
         assert!((worst + 0.012 / 1.075).abs() < 2e-4, "{worst}");
         let mut second = first.clone();

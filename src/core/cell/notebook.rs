@@ -1,15 +1,16 @@
-//! Condenses readings of a vehicle's cells into rows. The on-board fit of a cell model uses these rows.
+//! Condenses readings of a vehicle's cells into rows, from which the on-board fit determines a cell model.
 //!
 //! In: one [`CellStep`] per voltage reading of any cell (A, V, s, degrees C). Out: at most [`MAX_ROWS`] rows of the
 //! mean cell, which is the average of all cells.
 //!
-//! A row is the mean over a time in which the SOC hardly changes. A *stretch* is a period with a continuously measured
-//! current. In addition to the voltage, a row contains all inputs from which the fit predicts this voltage: the charge
-//! since the start of the stretch, the current, and the current after first-order filters with the time constants of
-//! the branches. A row can therefore be predicted without its neighbours, and single rows can be removed from a
-//! stretch. A mean hides current steps, so these are stored as the sums of a small regression. Rows are classified by
-//! SOC, temperature and direction of the current. A full notebook removes the oldest row of the class with the most
-//! rows, and thus keeps rare rows.
+//! A row is a mean over a time in which the SOC hardly changes. A *stretch* is a period with a continuously measured
+//! current. A row contains the voltage and all inputs from which the fit predicts it: the charge since the start of the
+//! stretch, the current, and the current after first-order filters with the time constants of the branches. Each row
+//! can therefore be predicted without its neighbours, and single rows can be removed.
+//!
+//! A mean hides current steps, so these are stored as the sums of a small regression. Rows are classified by SOC,
+//! temperature and direction of the current. A full notebook removes the oldest row of the class with the most rows, so
+//! that rare rows are kept.
 
 use serde::{Deserialize, Serialize};
 
@@ -17,16 +18,16 @@ use super::CellStep;
 use super::chemistry::TAU_S;
 use crate::quantity::InvalidState;
 
-/// Maximum number of rows. With 64 bytes per row, the notebook stays below 8 kB.
+/// Maximum number of rows. One row has 64 bytes, so the notebook stays below 8 kB.
 pub const MAX_ROWS: usize = 120;
-/// SOC, fraction. Below this SOC, rows and classes cover a smaller SOC range, because curves are steep and resistances
+/// Below this SOC (fraction), rows and classes cover a smaller SOC range, because curves are steep and resistances
 /// rise.
 const LOW_SOC: f64 = 0.15;
-/// SOC range that a row or class covers below `LOW_SOC`, as a fraction of the usual range.
+/// Width of rows and classes below `LOW_SOC`, as a fraction of the usual width.
 const LOW_SOC_PART: f64 = 0.25;
-/// Width of the SOC range that a class of rows covers, fraction.
+/// Width of a class (fraction of SOC).
 const CLASS_SOC: f64 = 0.1;
-/// Maximum current that counts as rest, in units of the 1 C current.
+/// Maximum current at rest, in units of the 1 C current.
 const REST_PER_H: f64 = 0.02;
 
 /// Number of current filters: one per branch of a model made from a label.
@@ -38,7 +39,7 @@ pub const FILTERS: usize = 3;
 pub struct Row {
     /// Number of the stretch that contains the row.
     pub stretch: u32,
-    /// SOC estimate of the row; it only selects the class.
+    /// SOC estimate that selects the class.
     soc: f32,
     /// Duration (s).
     pub seconds: f32,
@@ -50,7 +51,7 @@ pub struct Row {
     pub voltage_v: f32,
     /// Current (A).
     pub current_a: f32,
-    /// Current through a first-order filter per branch (A).
+    /// Current after the filter of each branch (A).
     pub filtered_a: [f32; FILTERS],
     /// Temperature (degrees C).
     pub temperature_c: f32,
@@ -58,8 +59,8 @@ pub struct Row {
     pub steps: CurrentSteps,
 }
 
-/// Sums of products of changes between two consecutive readings. i is the change of the current (A), x the change of
-/// the current after the fastest filter (A), v the change of the voltage (V).
+/// Sums of products of the changes between two consecutive readings. i is the change of the current (A), x is the
+/// change of the current after the fastest filter (A), and v is the change of the voltage (V).
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CurrentSteps {
@@ -75,7 +76,7 @@ pub struct CurrentSteps {
     pub xv: f32,
 }
 
-/// Readings of the cells that have not yet been combined into a reading of the mean cell.
+/// Readings that have not yet been combined into a reading of the mean cell.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 struct Readings {
     count: u32,
@@ -88,7 +89,6 @@ struct Readings {
     temperature_c: f64,
 }
 
-/// Sums over time for the row that is not yet complete.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 struct RowSums {
     seconds: f64,
@@ -99,20 +99,17 @@ struct RowSums {
     filtered_a: [f64; FILTERS],
     temperature_c: f64,
     steps: [f64; 5],
-    /// Charge and temperature at the start of the row.
+    /// Charge (Ah) and temperature (degrees C) at the start of the row.
     first: Option<(f64, f64)>,
 }
 
-/// The present stretch: a time with a continuously measured current.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 struct Stretch {
     charge_ah: f64,
-    /// Time since the stretch began (s).
     elapsed_s: f64,
     filtered_a: [f64; FILTERS],
     /// Current, current after the fastest filter, and voltage of the previous reading.
     last: [f64; 3],
-    /// Duration of the present rest (s).
     rest_s: f64,
     row: RowSums,
 }
@@ -133,9 +130,7 @@ pub struct PresentStretch {
 #[serde(deny_unknown_fields)]
 pub struct Notebook {
     rows: Vec<Row>,
-    /// Number of the present stretch.
     number: u32,
-    /// Number of rows added since the last [`Self::mark_read`] that are still present.
     unread: u32,
     readings: Readings,
     present: Option<Stretch>,
@@ -158,7 +153,6 @@ impl NotebookConfig {
         Self { cells, rated_ah, tau_s: TAU_S }
     }
 
-    /// Currents below this value (A), count as rest.
     fn rest_a(&self) -> f64 {
         REST_PER_H * self.rated_ah
     }
@@ -175,17 +169,17 @@ impl Notebook {
         self.unread as usize
     }
 
-    /// Marks all present rows as used.
+    /// Marks all rows as read.
     pub fn mark_read(&mut self) {
         self.unread = 0;
     }
 
-    /// Returns the notebook with all rows marked as unused.
+    /// Returns the notebook with all rows marked as unread.
     pub fn all_unread(self) -> Self {
         Self { unread: u32::try_from(self.rows.len()).unwrap_or(u32::MAX), ..self }
     }
 
-    /// Rows added since the last [`Self::mark_read`] that are still present.
+    /// The unread rows.
     pub fn new_rows(&self) -> &[Row] {
         &self.rows[self.rows.len().saturating_sub(self.unread as usize)..]
     }
@@ -200,7 +194,7 @@ impl Notebook {
         self.rows[first.saturating_sub(1)..].windows(2).map(moved).sum()
     }
 
-    /// Number of unread rows whose class of SOC, temperature and direction has no earlier row.
+    /// Number of unread rows whose class (SOC, temperature and direction) has no earlier row.
     pub fn rows_of_new_classes(&self, rated_ah: f64) -> usize {
         let (old, new) = self.rows.split_at(self.rows.len() - self.new_rows().len());
         new.iter().filter(|row| old.iter().all(|old| old.class(rated_ah) != row.class(rated_ah))).count()
@@ -218,7 +212,7 @@ impl Notebook {
         self.present.as_ref().map(|stretch| stretch.filtered_a)
     }
 
-    /// Adds a reading. Returns whether a row is complete; the caller then calls [`Self::close_row`].
+    /// Adds a reading. If it returns true, a row is complete, and the caller must call [`Self::close_row`].
     #[inline]
     pub fn add(&mut self, config: &NotebookConfig, step: &CellStep) -> bool {
         let readings = &mut self.readings;
@@ -236,19 +230,19 @@ impl Notebook {
         }
         // The mean cell has at most one reading per second.
         let is_due = readings.count >= config.cells && readings.measured_s >= f64::from(config.cells);
-        // Outside a stretch, no measured time is needed: one reading per cell begins a stretch.
+        // Outside a stretch, one reading per cell begins a stretch, even without measured time.
         let begins = self.present.is_none() && readings.count >= config.cells;
         (is_due || begins) && self.close_readings(config, step.ambient_c)
     }
 
-    /// Turns the readings into one reading of the mean cell. Returns whether a row is complete.
+    /// Combines the readings into one reading of the mean cell. Returns whether a row is complete.
     fn close_readings(&mut self, config: &NotebookConfig, ambient_c: f64) -> bool {
         let Readings { count, temperatures, measured_s, unmeasured_s, charge_as, current_a, voltage_v, temperature_c } =
             std::mem::take(&mut self.readings);
         let (cells, count) = (f64::from(config.cells), f64::from(count));
         let temperature_c = if temperatures > 0 { temperature_c / f64::from(temperatures) } else { ambient_c };
         let (dt_s, current_a, voltage_v) = (measured_s / cells, current_a / count, voltage_v / count);
-        // The stretch ends if the current was unmeasured for more than 10 s (the sum is over all cells).
+        // If the current was unmeasured for more than 10 s, the stretch ends. The sum is over all cells.
         if unmeasured_s > 10.0 * cells {
             self.end_stretch(config);
         }
@@ -256,7 +250,7 @@ impl Notebook {
         let last_soc = last.map(|row| (f64::from(row.soc), f64::from(row.charge_ah)));
         let Some(stretch) = &mut self.present else {
             self.number = self.number.wrapping_add(1);
-            // The previous load is unknown, so the branches count as settled.
+            // The previous load is unknown, so the branches are assumed to be settled.
             let filtered_a = [current_a; FILTERS];
             let last = [current_a, current_a, voltage_v];
             self.present = Some(Stretch {
@@ -277,8 +271,7 @@ impl Notebook {
         let charge_before_ah = stretch.charge_ah;
         stretch.charge_ah += charge_as / cells / 3600.0;
         stretch.elapsed_s += dt_s;
-        // A single reading per cell represents the end of its interval; the mean of several readings represents the
-        // middle.
+        // One reading per cell represents the end of its interval. The mean of several readings represents the middle.
         let late = if count > cells { 0.5 } else { 1.0 };
         let along = |before: f64, after: f64| before + late * (after - before);
         let filtered_a: [f64; FILTERS] = std::array::from_fn(|i| along(before_a[i], stretch.filtered_a[i]));
@@ -287,7 +280,7 @@ impl Notebook {
         let [i, x, v] = [current_a, filtered_a[0], voltage_v];
         let [last_i, last_x, last_v] = std::mem::replace(&mut stretch.last, [i, x, v]);
         let row = &mut stretch.row;
-        // A difference between readings more than 3 s apart does not count as a step.
+        // The change between readings more than 3 s apart is not a step.
         if dt_s <= 3.0 {
             let [di, dx, dv] = [i - last_i, x - last_x, v - last_v];
             let products = [di * di, di * dx, dx * dx, di * dv, dx * dv];
@@ -304,7 +297,7 @@ impl Notebook {
         let soc = last_soc.map_or(1.0, |(soc, last_ah)| soc - (charge_ah - last_ah) / config.rated_ah);
         let part = if soc < LOW_SOC { LOW_SOC_PART } else { 1.0 };
         (charge_ah - first_ah).abs() >= part * 0.02 * config.rated_ah
-            // A row at rest takes at least half as long as the rest so far, so a night gives only a few rows.
+            // At rest, a row takes at least half as long as the rest so far, so that a night gives only a few rows.
             || row.seconds >= f64::max(300.0, 0.5 * stretch.rest_s)
             || (temperature_c - first_c).abs() >= 4.0
     }
@@ -335,8 +328,8 @@ impl Notebook {
         self.make_room(config);
     }
 
-    /// Ends the present row when the vehicle rests or the stretch ends. If the row is shorter than 20 s or the first
-    /// row of the stretch, does nothing.
+    /// Ends the present row when the vehicle rests or the stretch ends. Does nothing if the row is shorter than 20 s or
+    /// the first row of the stretch.
     pub fn finish_row(&mut self, config: &NotebookConfig) {
         let before = self.rows.last().filter(|row| row.stretch == self.number).copied();
         if let (Some(stretch), Some(before)) = (&self.present, before)
@@ -347,13 +340,12 @@ impl Notebook {
         }
     }
 
-    /// Ends the present stretch. The next reading starts a new stretch.
+    /// Ends the present stretch.
     pub fn end_stretch(&mut self, config: &NotebookConfig) {
         self.finish_row(config);
         (self.readings, self.present) = (Readings::default(), None);
     }
 
-    /// Removes rows until the limits on stretches and rows are met.
     fn make_room(&mut self, config: &NotebookConfig) {
         let class_of = |row: &Row| row.class(config.rated_ah);
         // Each stretch adds a parameter to the fit: its initial SOC.
@@ -377,8 +369,8 @@ impl Notebook {
         }
     }
 
-    /// The past stretch whose removal loses the fewest rows of classes that no other stretch has. If several stretches
-    /// qualify, returns the oldest of them.
+    /// The past stretch with the fewest rows whose class occurs in no other stretch. If several stretches qualify,
+    /// returns the oldest.
     fn least_missed(&self, config: &NotebookConfig) -> Option<u32> {
         let class_of = |row: &Row| row.class(config.rated_ah);
         let alone = |stretch: &[Row]| {
@@ -430,12 +422,11 @@ impl Notebook {
 }
 
 impl Row {
-    /// SOC estimate of the row, fraction.
+    /// SOC estimate (fraction).
     pub fn soc(&self) -> f64 {
         f64::from(self.soc)
     }
 
-    /// Class of SOC, temperature and direction.
     fn class(&self, rated_ah: f64) -> (i32, i32, i32) {
         let rest_a = REST_PER_H * rated_ah;
         let current_a = f64::from(self.current_a);

@@ -1,8 +1,9 @@
-//! Model of this pack's own cells: the label's model, corrected by the vehicle's readings.
+//! Cell model of this pack's own cells: the model of the label (chemistry, rated capacity, voltage limits), corrected
+//! by the vehicle's readings.
 //!
 //! In: a [`Label`] and the rows (averaged readings) of a [`Notebook`](super::notebook::Notebook). Out: an [`OwnModel`],
-//! from which the [`CellModel`] of the filters is made. Where the notebook has no rows, the label's model and its
-//! uncertainty remain.
+//! from which the [`CellModel`] of the filters is made. In SOC and temperature ranges without rows, the label's model
+//! and its uncertainty remain.
 
 pub mod fit;
 pub mod task;
@@ -25,19 +26,19 @@ pub const SOC_NODES: usize = 21;
 pub struct OwnModel {
     /// Open-circuit curve (V), rising.
     pub curve_v: [f64; SOC_NODES],
-    /// Modes of the curve's uncertainty (V) per standard deviation.
+    /// Independent modes of the curve's uncertainty (V per standard deviation).
     pub modes_v: [[f64; SOC_NODES]; 2],
-    /// Standard deviation of the curve that the modes do not explain (V).
+    /// Standard deviation of the curve (V) that the modes do not explain.
     pub rest_v: [f64; SOC_NODES],
     /// Resistances relative to the resistances of the label's model.
     pub factors: ResistanceFactors,
     /// Standard deviation of ln(voltage drop) at each temperature breakpoint of the model.
     pub drop_std: [f64; TEMPERATURE_NODES],
-    /// Fall of the curve from 25 to 0 degrees C (V).
+    /// Sag of the curve at 0 degrees C relative to 25 degrees C (V).
     pub cold_sag_v: ScalarGaussian,
     /// Capacity (Ah).
     pub capacity: ScalarGaussian,
-    /// Root mean square of the rows' residuals (predicted minus measured voltage) (V).
+    /// Root mean square of the predicted minus the measured voltages of the rows (V).
     pub residual_v: f64,
 }
 
@@ -48,7 +49,7 @@ impl OwnModel {
         self.cell_model_with(label, self.spread_within_pack(), name)
     }
 
-    /// The cell model with a spread between cells and a name; `None` if the label has no model.
+    /// Cell model with the given spread and name; `None` if the label has no model.
     pub(super) fn cell_model_with(&self, label: &Label, spread: ModelSpread, name: String) -> Option<CellModel> {
         let curve = CurveOfCells {
             mean_v: self.curve_v.to_vec(),
@@ -62,7 +63,7 @@ impl OwnModel {
         Some(model)
     }
 
-    /// Spread of the cells of the pack whose model this is.
+    /// Differences between the cells of this pack.
     pub(super) fn spread_within_pack(&self) -> ModelSpread {
         ModelSpread {
             curve_v: median(self.rest_v.iter().copied()).unwrap_or_default(),
@@ -78,7 +79,7 @@ impl OwnModel {
     /// The estimator's settings for the learned `model`, derived from the settings for the label's model.
     pub fn estimator_config(&self, base: &EstimatorConfig, label: &CellModel, model: &CellModel) -> EstimatorConfig {
         let (Some(old), Some(new)) = (label.spread, model.spread) else { return *base };
-        // If the configuration replaced the label's value, keep the configured value.
+        // Keeps values that come from the configuration and not from the label.
         let instead = |value: f64, old: f64, new: f64| if value == old { new } else { value };
         let parts = |value: f64, old: f64, new: f64| (value * value - old * old).max(0.0).sqrt().hypot(new);
         let mut config = *base;
@@ -95,7 +96,7 @@ impl OwnModel {
         config
     }
 
-    /// Whether the remaining uncertainty is small: the standard deviation of the capacity is below 3 %.
+    /// Whether the uncertainty is small: the standard deviation of the capacity is below 3 %.
     pub fn is_settled(&self) -> bool {
         self.capacity.std() < 0.03 * self.capacity.mean
     }
@@ -127,8 +128,8 @@ impl OwnModel {
     }
 }
 
-/// Cost of rows: minus the logarithm of the probability density that a model (`own`; `None` = the label's model) gives
-/// the rows. Returns `None` without rows.
+/// Cost of rows: minus the logarithm of the probability density that the model `own` gives the rows (`None` = the
+/// label's model). Returns `None` without rows.
 pub fn rows_cost(prior: &LabelPrior, own: Option<&OwnModel>, rows: &[Row]) -> Option<f64> {
     fit::rows_cost(prior, own, rows)
 }

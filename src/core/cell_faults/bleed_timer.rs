@@ -1,11 +1,11 @@
-//! Measures from the BMS's balancing bits how long the BMS bled one cell, that is, discharged the cell through a
-//! balancing resistor.
+//! Measures from the balancing bits how long the BMS bled one cell, that is, discharged it through a balancing
+//! resistor.
 //!
-//! In: balancing bits with their time and validity; starts and ends of rows (a few minutes of samples each). Out: for
-//! the time from the middle of one row to the middle of the next, how long the cell was bled, how long the bit could
-//! not be read, and how long no bit was valid. The charge that a row shows is the charge at the middle of the row, so
-//! half of the row's bleed time counts in the next row. If the cell is bled between two rows, while the buses sleep,
-//! this time counts in the later row.
+//! In: balancing bits with their expiry, and the starts and ends of rows (a few minutes of samples each). Out: for
+//! the time from the middle of one row to the middle of the next, a [`BleedTime`].
+//!
+//! A row shows the charge at its middle, so half of its bleed time counts in the next row. Bleed time between two
+//! rows, while the buses sleep, counts in the later row.
 
 use serde::{Deserialize, Serialize};
 
@@ -14,24 +14,22 @@ use crate::quantity::{InvalidState, Timestamp};
 /// Meaning of a BMS's balancing bits.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct BalancingConfig {
-    /// Current that the balancing resistor of one cell takes (A).
+    /// Current through the balancing resistor of one cell (A).
     pub bleed_a: f64,
-    /// A bit expires after this time (s), unless a newer bit replaces it earlier.
+    /// Time after which a bit expires (s).
     pub max_age_s: f64,
-    /// Whether the BMS bleeds cells only while it sends bits. If false, it is unknown whether cells are bled while no
-    /// bits are sent.
+    /// Whether the BMS bleeds cells only while it sends bits. If false, it may also bleed cells while it sends no
+    /// bits.
     pub is_only_while_sent: bool,
 }
 
-/// Parts of a period (s). During the rest of the period, the cell was not bled.
+/// Times within a period (s): the cell was bled, the latest bit could not be read, or no bit was valid. For the rest
+/// of the period, the cell was not bled.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct BleedTime {
-    /// Time in which the cell was bled.
     pub(super) bled_s: f64,
-    /// Time in which the latest bit could not be read.
     pub(super) unknown_s: f64,
-    /// Time in which no bit was valid.
     pub(super) silent_s: f64,
 }
 
@@ -49,7 +47,6 @@ impl BleedTime {
     }
 }
 
-/// The latest balancing bit.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Bit {
@@ -68,7 +65,6 @@ pub(super) struct BleedTimer {
     counted_until: Option<Timestamp>,
     /// Bleed time from the middle of the last row to the start of the current row (s).
     before: BleedTime,
-    /// Bleed time in the current row (s).
     row: BleedTime,
 }
 
@@ -82,7 +78,7 @@ impl BleedTimer {
         self.bit = Some(Bit { is_bled, holds_until });
     }
 
-    /// Handles a period in which the daemon did not run, so it received no bits.
+    /// Handles a period in which the daemon did not run.
     pub(super) fn note_missed_bits(&mut self, from: Timestamp, to: Timestamp) {
         if self.has_bits {
             self.take(from, None, to);
@@ -119,18 +115,15 @@ impl BleedTimer {
         std::mem::replace(&mut self.before, half).plus(half)
     }
 
-    /// Discards all counted time.
     pub(super) fn forget_time(&mut self) {
         *self = Self { has_bits: self.has_bits, ..Self::default() };
     }
 
-    /// Shifts all timestamps by `by_nanos`, to another clock.
     pub(super) fn rebase(&mut self, by_nanos: i64) {
         self.counted_until = self.counted_until.map(|until| until.plus_nanos(by_nanos));
         self.bit = self.bit.map(|bit| Bit { holds_until: bit.holds_until.plus_nanos(by_nanos), ..bit });
     }
 
-    /// Checks the numbers of a stored state.
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         let seconds = [self.before, self.row].into_iter().flat_map(|it| [it.bled_s, it.unknown_s, it.silent_s]);
         InvalidState::unless_naturals("the time for which a cell was bled", seconds)

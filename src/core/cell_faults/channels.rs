@@ -6,18 +6,18 @@ use serde::{Deserialize, Serialize};
 use super::row::CellSums;
 use crate::quantity::InvalidState;
 
-/// A channel is frozen if its value stays the same while the middle voltage of the pack changes by more than this (V).
+/// If the middle voltage of the pack changes by more than this while a channel's value stays the same, the channel is
+/// frozen (V).
 const FROZEN_V: f64 = 0.03;
-/// Minimum number of voltage changes within a row (a few minutes of samples); with fewer changes, channels are not
-/// compared. [`Channel::doubled`] also requires that the channels agree in ten consecutive rows: with a resolution of
-/// 2.5 mV, two of 96 healthy cells agreed in three rows.
+/// Minimum number of voltage changes within a row (a few minutes of samples) for a comparison of channels.
+/// [`Channel::doubled`] also requires that the channels agree in ten consecutive rows. With a resolution of 2.5 mV,
+/// two of 96 healthy cells agreed in three rows.
 const LEAST_CHANGES: u32 = 10;
 
-/// State of one voltage channel.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(super) struct Channel {
-    /// Middle voltage of the pack (V), in the row in which the channel's value last changed. Before the first change,
-    /// the middle voltage in the first row after the start or after a gap.
+    /// Middle voltage of the pack (V) in the row in which the channel's value last changed. Before the first change:
+    /// in the first row after the start or after a gap.
     middle_v: Option<f64>,
     pub(super) is_frozen: bool,
     /// The channel that shows the same values, and the number of consecutive rows in which the two channels agreed.
@@ -25,7 +25,6 @@ pub(super) struct Channel {
 }
 
 impl Channel {
-    /// Ends a row. `middle_v` is the middle voltage of the pack (V).
     pub(super) fn end_row(&mut self, sums: &CellSums, middle_v: f64) {
         if sums.changes > 0 {
             (self.middle_v, self.is_frozen) = (Some(middle_v), false);
@@ -45,7 +44,6 @@ impl Channel {
         self.same_as.filter(|(_, rows)| *rows >= 10).map(|(other, _)| other)
     }
 
-    /// Checks a stored channel of a pack of `cells` cells.
     pub(super) fn check(&self, cells: usize) -> Result<(), InvalidState> {
         InvalidState::unless_numbers("the voltage of a frozen channel's pack", self.middle_v)?;
         let (other, _) = self.same_as.unwrap_or_default();
@@ -59,8 +57,7 @@ impl Channel {
 }
 
 /// Compares the channels of a row. Two channels form a pair if they show the same sequence of values and no third
-/// channel shows it. If there are too few different sequences (at most half as many as cells), no channel counts as
-/// doubled.
+/// channel shows it. If the number of different sequences is at most half of the number of cells, there are no pairs.
 pub(super) fn compare(channels: &mut [Channel], sums: &[CellSums]) {
     let compared = |cell: &usize| sums[*cell].changes >= LEAST_CHANGES;
     let mut order: Vec<usize> = (0..sums.len()).filter(compared).collect();

@@ -1,9 +1,9 @@
 //! Detects faults of the cells of a pack and of their sensors. The detector adds samples to rows (sums over a few
 //! minutes), compares the cells once per row and derives findings from the comparison (`judge`).
 //!
-//! The assumed errors of a row are rounded values for a circuit model and a typical cell monitor. These values were
-//! checked with a simulated pack of ten cells and with the simulator's other packs. Only the slope of a label's curve
-//! (`pack_slope`) and the limit of a charge difference were also chosen on two measured cars.
+//! The assumed errors of a row are rounded values for a circuit model and a typical cell monitor, checked on
+//! simulated packs. Only the slope of the open-circuit curve (`pack_slope`) and the limit of a charge difference were
+//! also tuned on measurements of two cars.
 
 mod balancing;
 mod judge;
@@ -28,28 +28,27 @@ use judge::Population;
 use shared_row::Row;
 
 /// Length of a row. A row ends when the fraction `ROW_SOC` of the capacity has been charged or discharged, or after
-/// `ROW_S` seconds. During a long rest, the row may last for the fraction `REST_PART` of the rest's duration, because
-/// more samples add no information. Shorter rows would show a bad contact sooner. With shorter rows, however, the
-/// detector would mistake an aged cell for a bad contact, and would miss exchanged channels.
+/// `ROW_S` seconds. During a rest, a row may last up to the fraction `REST_PART` of the rest, because more samples
+/// add no information. Shorter rows would show a bad contact sooner. However, the detector would then mistake an aged
+/// cell for a bad contact, and would miss exchanged channels.
 const ROW_SOC: f64 = 0.02;
 const ROW_S: f64 = 300.0;
 const REST_PART: f64 = 0.5;
 /// Minimum number of cells for a comparison.
 pub(super) const LEAST_CELLS: usize = 3;
-/// Standard deviations for a resistance measured from current steps: `STEP_PART` of the resistance, fraction; `STEP_V`
-/// of the voltage of one step (V).
+/// Standard deviations of a resistance measurement from current steps: `STEP_PART` is a fraction of the resistance,
+/// `STEP_V` applies to the voltage of one step (V).
 const STEP_PART: f64 = 0.05;
 const STEP_V: f64 = 0.003;
-/// Minimum sum of squared current steps; with a smaller sum, no resistance is measured. Unit: square of the 1 C
-/// current.
+/// Minimum sum of squared current steps for a resistance measurement (squares of the 1 C current).
 const LEAST_STEPS: f64 = 0.02;
-/// SOC, fraction. If the change of the mean cell's SOC between two rows differs from the counted charge by this much or
-/// more, the counted charge is used.
+/// If the estimated change of the mean cell's SOC differs from the counted charge by at least this fraction, the
+/// counted charge is used.
 const SOC_JUMP: f64 = 0.02;
-/// Number of fault kinds up to and including `HighCharge`. All kinds that apply to single cells are among them.
+/// Number of fault kinds up to `HighCharge`. All kinds that apply to single cells are among them.
 const CELL_KINDS: usize = CellFaultKind::HighCharge as usize;
 
-/// Estimates of the mean cell at one time.
+/// Estimates of the mean cell (an imaginary cell with the typical values of the pack) at one time.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MeanCell {
     /// SOC, fraction.
@@ -64,7 +63,6 @@ pub struct MeanCell {
     pub charge_ah: f64,
 }
 
-/// State of one cell.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct WatchedCell {
@@ -73,7 +71,7 @@ struct WatchedCell {
     #[serde(default = "yes", skip_serializing_if = "Clone::clone")]
     is_compared: bool,
     difference: Difference,
-    /// Means of the states before the latest rows that contradict the prediction.
+    /// Means of the states when a row last agreed with the prediction.
     settled: [f64; STATES],
     /// Means of the states before the last sudden change.
     before_jump: [f64; STATES],
@@ -82,9 +80,8 @@ struct WatchedCell {
     #[serde(default, skip_serializing_if = "Bleed::is_unused")]
     bleed: Bleed,
     temperature: WarmingRatio,
-    /// Per kind of fault: time since which the fault has been more likely than not.
+    /// For each kind of fault: since when the fault has been more likely than not.
     suspected: [Option<Timestamp>; CELL_KINDS],
-    /// Time of the last sudden change.
     jumped: Option<Timestamp>,
 }
 
@@ -93,7 +90,6 @@ fn yes() -> bool {
 }
 
 impl WatchedCell {
-    /// Creates the state of a cell before its first row.
     fn new(is_compared: bool) -> Self {
         Self {
             is_compared,
@@ -109,7 +105,6 @@ impl WatchedCell {
         }
     }
 
-    /// Discards the samples of the present row, because the next sample follows a gap.
     fn interrupt(&mut self) {
         self.sums.interrupt();
         self.channel.interrupt();
@@ -124,13 +119,12 @@ pub struct CellFaultDetector {
     pack: PackSums,
     /// The last row: time of the row's middle, SOC and charge (Ah).
     last_row: Option<(Timestamp, f64, f64)>,
-    /// Duration of the present rest (s).
     rest_s: f64,
     /// Series resistance of the mean cell in the present row (ohm).
     ohm: f64,
     /// The middle cell: the cell whose SOC and resistance are closest to the medians.
     middle: usize,
-    /// Whether a BMS may bleed every cell except the lowest one.
+    /// Whether the BMS may bleed (discharge through a resistor) every cell except the lowest.
     is_balanced: bool,
     /// The cell with the lowest charge; `None` if no cell is clearly the lowest.
     lowest: Option<usize>,
@@ -138,13 +132,14 @@ pub struct CellFaultDetector {
     slope: PackSlope,
     /// Slope of the open-circuit curve in the last row (V per unit of SOC).
     slope_v: f64,
-    /// Whether the cell model is the model of a label, so that the open-circuit curve is uncertain.
+    /// Whether the cell model was derived from a label (chemistry and capacity). Its open-circuit curve is then
+    /// uncertain.
     is_prior: bool,
     findings: Vec<CellFault>,
 }
 
 impl CellFaultDetector {
-    /// Creates a detector for a pack in which only the cells `compared` are of the same type. The caller must not
+    /// Creates a detector that compares only the cells `compared`, which are of the same type. The caller must not
     /// [add](Self::add) samples of other cells.
     pub fn among(cells: usize, compared: &[usize]) -> Self {
         let mut diagnosis = Self::new(if compared.len() < LEAST_CELLS { 0 } else { cells });
@@ -203,9 +198,9 @@ impl CellFaultDetector {
         self.cells.get(cell.index()).filter(|cell| cell.is_compared).map(|cell| &cell.difference)
     }
 
-    /// A cell's states minus the median of the pack. `None` if the detector is inactive or the pack has no such cell. A
-    /// state is `None` if it is unknown: every state of a cell that is not compared, and the leak of a cell that the
-    /// BMS may bleed.
+    /// A cell's states minus the median of the pack. `None` if the detector is inactive or the pack has no such cell.
+    /// Unknown states are `None`: all states of a cell that is not compared, and the leak of a cell that the BMS may
+    /// bleed.
     pub fn relative(&self, cell: CellIndex) -> Option<[Option<ScalarGaussian>; STATES]> {
         let WatchedCell { is_compared, difference, .. } = self.cells.get(cell.index())?;
         Some(std::array::from_fn(|state| {
@@ -216,13 +211,12 @@ impl CellFaultDetector {
         }))
     }
 
-    /// The cell whose estimate represents the mean cell in the present row.
+    /// The real cell whose estimates stand for the mean cell.
     #[inline]
     pub fn middle(&self) -> usize {
         self.middle
     }
 
-    /// Time of the last row, and SOC of the mean cell in this row; `None` before the first row.
     pub(super) fn middle_soc(&self) -> Option<(Timestamp, f64)> {
         self.last_row.map(|(time, soc, _)| (time, soc))
     }
@@ -244,8 +238,8 @@ impl CellFaultDetector {
         }
     }
 
-    /// Adds the mean cell's values at `time`. Before this call, the caller adds all samples with the same time. Returns
-    /// whether the row is complete. If so, the caller ends the row with [`Self::close_row`].
+    /// Adds the mean cell's values at `time`. The caller first adds all samples of this time. Returns whether the row
+    /// is complete. If so, the caller ends the row with [`Self::close_row`].
     pub fn note(&mut self, time: Timestamp, mean: &MeanCell, capacity_ah: f64) -> bool {
         if ![mean.soc, mean.current_a, mean.drop_v, mean.temperature_c, mean.charge_ah].iter().all(|it| it.is_finite())
         {
@@ -292,8 +286,8 @@ impl CellFaultDetector {
         find(&self.findings).filter(|_| !was_known)
     }
 
-    /// Handles the learned values of all cells, once per day. If a rise of the current sensor's gain has been newly
-    /// found, returns the finding.
+    /// Checks once per day whether the learned values of all cells show a rise of the current sensor's gain. Returns
+    /// the finding if it is new.
     pub fn note_day(
         &mut self,
         time: Timestamp,
@@ -311,8 +305,8 @@ impl CellFaultDetector {
     ///
     /// * `socs`: estimated SOC of each cell, to choose the middle cell.
     /// * `is_balanced`: whether the BMS may bleed fuller cells after a charge.
-    /// * `balancing`: meaning of the balancing bits, if the BMS sends them.
-    /// * `is_prior`: whether the model is the model of a label, neither given nor learned.
+    /// * `balancing`: balancing settings, if the BMS sends balancing bits.
+    /// * `is_prior`: whether the model was derived from a label, instead of being given or learned.
     pub fn close_row(
         &mut self,
         (model, is_prior): (&CellModel, bool),
@@ -334,7 +328,7 @@ impl CellFaultDetector {
         if !is_prior {
             self.slope.forget();
         } else if let Some(middle_v) = middle_v {
-            // The middle voltage already includes the drop of the series resistance `ohm`.
+            // The middle voltage is already corrected for the drop of the series resistance `ohm`.
             let ocv_v = middle_v + drop_v - self.ohm * current_a;
             curve_soc = PackSlope::position(model, capacity_ah, temperature_c, soc, ocv_v);
             self.slope.add(model, capacity_ah, temperature_c, SlopeRow { charge_ah, soc: curve_soc, ocv_v, drop_v });
@@ -361,19 +355,17 @@ impl CellFaultDetector {
         self.findings.iter().filter(is_new).copied().collect()
     }
 
-    /// Predicts the state of all cells from the time and the charge since the last row.
     fn pass(&mut self, time: Timestamp, row: &Row<'_>) {
         let Some((last, last_soc, last_ah)) = self.last_row.replace((time, row.soc, row.charge_ah)) else { return };
         let counted = (last_ah - row.charge_ah) / row.capacity_ah;
         let estimated = row.soc - last_soc;
-        // If the estimated SOC jumped, the filter has corrected its estimate although no charge has moved. Use the
-        // counted charge instead.
+        // If the estimated SOC jumped, the filter corrected its estimate although no charge moved. Use the counted
+        // charge instead.
         let change = if (estimated - counted).abs() < SOC_JUMP { estimated } else { counted };
         let days = (time.since(last) / DAY_S).max(0.0);
         self.cells.iter_mut().for_each(|cell| cell.difference.pass(days, change));
     }
 
-    /// Compares every cell's mean voltage with the middle voltage of the pack, `seconds` after the previous row.
     fn observe(&mut self, time: Timestamp, seconds: f64, row: &Row<'_>, voltages_v: &[Option<f64>], middle_v: f64) {
         let to_reference = self.slope.reference_soc() - row.curve_soc;
         let mut charges = Vec::with_capacity(self.cells.len());
@@ -409,7 +401,6 @@ impl CellFaultDetector {
         self.slope.learn_from_cells(row.curve_soc, row.model_slope_v(), charges);
     }
 
-    /// Compares the series resistances of the cells, as measured from current steps.
     fn observe_steps(&mut self, row: &Row<'_>) {
         let least_a2 = LEAST_STEPS * row.capacity_ah * row.capacity_ah;
         let ohms: Vec<Option<(f64, f64)>> = self.cells.iter().map(|cell| cell.sums.ohm(least_a2)).collect();
@@ -421,8 +412,8 @@ impl CellFaultDetector {
             let mean = cell.difference.mean();
             ohm - middle_ohm - slope[RESISTANCE] * mean[RESISTANCE] - slope[CONTACT] * mean[CONTACT]
         };
-        // The scatter between the cells includes the noise of the voltage channels. Channels with a coarse resolution
-        // are noisy.
+        // The scatter between the cells includes the noise of the voltage channels, which is high for a coarse
+        // resolution.
         let innovations =
             self.cells.iter().zip(&ohms).filter_map(|(cell, ohm)| Some(innovation_ohm(cell, ohm.as_ref()?.0)));
         let scatter_ohm = Population::of(innovations).std;
@@ -447,7 +438,6 @@ impl CellFaultDetector {
         }
     }
 
-    /// Compares the warming at each cell with the median warming of the pack.
     fn observe_temperatures(&mut self, time: Timestamp, seconds: f64) {
         let of_cells: Vec<Option<f64>> = self.cells.iter().map(|cell| cell.sums.mean_c()).collect();
         if of_cells.iter().flatten().count() < LEAST_CELLS {

@@ -1,8 +1,8 @@
 //! Filter of the difference between one cell and the middle of its pack.
 //!
 //! In: per row (a few minutes of samples), the cell's voltage minus the middle voltage of the pack. Out: the states
-//! that explain this voltage difference. The filter is a linear Kalman filter, linearised at the cell's own SOC. The
-//! filter can distinguish the states because the states have different effects:
+//! that explain this voltage difference. The filter is a linear Kalman filter, linearised at the cell's own SOC. It
+//! can distinguish the states because their effects differ:
 //!
 //! | state | effect on the voltage difference |
 //! | --- | --- |
@@ -13,9 +13,9 @@
 //! | channel | constant |
 //! | leak | grows with time |
 //!
-//! Sources: one filter estimates the mean cell, and this filter estimates the difference of one cell from the mean
-//! cell, as in Plett's bar-delta filtering (Battery Management Systems II, section 4.11). For the contact resistance of
-//! one cell in a vehicle: Zheng et al., J. Power Sources 241 (2013) 181.
+//! Sources: Plett, Battery Management Systems II, section 4.11 (bar-delta filtering: one filter for the mean cell,
+//! one filter for each difference). Zheng et al., J. Power Sources 241 (2013) 181 (contact resistance of one cell in
+//! a vehicle).
 
 use serde::{Deserialize, Serialize};
 
@@ -40,8 +40,8 @@ const PAIRS: usize = STATES * (STATES + 1) / 2;
 
 /// Standard deviations before the first row. The value for the voltage channel is typical of cell monitors.
 const FIRST_STD: [f64; STATES] = [0.05, 0.1, 0.2, 0.5, 0.005, 0.05];
-/// Random walk of the states: standard deviations gained within one day. `MOVED_STD`: standard deviation that the state
-/// [`SOC`] gains from one row to the next, per unit of SOC that the mean cell moves.
+/// Random walk of the states: standard deviations gained within one day. `MOVED_STD`: standard deviation that the
+/// state [`SOC`] gains per unit of SOC that the mean cell moves.
 const DAILY_STD: [f64; STATES] = [1e-4, 3e-4, 5e-3, 5e-3, 3e-4, 1e-4];
 const MOVED_STD: f64 = 5e-4;
 /// Standard deviations added after a sudden change of a single cell: its contact or its channel has changed, or the
@@ -52,9 +52,9 @@ const REPLACED_STD: [f64; STATES] = [0.05, 0.1, 0.3, 0.1, 0.005, 0.01];
 /// Standard deviations added if only the resistance has changed suddenly. Resistance grows by ageing over weeks, so the
 /// cause must be the contact.
 const RESISTANCE_STD: [f64; STATES] = [0.0, 0.0, 0.01, 0.5, 0.0, 0.0];
-/// If a BMS may bleed a cell: standard deviation of the charge that the cell loses, fraction of the capacity per day.
-/// After a time without rows, the loss may be larger; `open_charge` handles this case. If the value were 0.01, the
-/// detector would miss exchanged channels and modules.
+/// Standard deviation of the charge that a cell loses if a BMS may bleed it (discharge it for balancing), fraction of
+/// the capacity per day. With 0.01, the detector would miss exchanged channels and modules. A larger loss in a time
+/// without rows is handled by `open_charge`.
 const BLED_PER_DAY: f64 = 0.002;
 /// Limits of the innovation, in standard deviations. Above `HUBER`, a row has a reduced weight. Above `JUMP` (for the
 /// mean voltage) or `STEPS_JUMP` (for the resistance from current steps), a row is odd. Three consecutive odd rows
@@ -76,7 +76,6 @@ pub struct Difference {
     odd_steps: i8,
 }
 
-/// Kind of a sudden change.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Jump {
     /// A single cell changed.
@@ -113,7 +112,6 @@ const fn pair(i: usize, j: usize) -> usize {
 }
 
 impl Difference {
-    /// Creates the filter of a cell before its first row.
     pub(super) fn new() -> Self {
         let mut covariance = [0.0; PAIRS];
         for (i, std) in FIRST_STD.iter().enumerate() {
@@ -127,8 +125,8 @@ impl Difference {
         ScalarGaussian { mean: self.mean[state], variance: self.covariance[pair(state, state)] }
     }
 
-    /// Difference in SOC from the mean cell after the mean cell's SOC has changed by `soc_change`, without a leak. It
-    /// follows from the present difference and the difference in capacity, to first order.
+    /// Difference in SOC from the mean cell after the mean cell's SOC has changed by `soc_change`. Computed to first
+    /// order from the difference in capacity, without the leak.
     pub(super) fn soc_after(&self, soc_change: f64) -> ScalarGaussian {
         let variance = self.covariance[pair(SOC, SOC)]
             + soc_change
@@ -172,7 +170,6 @@ impl Difference {
         self.keep_possible();
     }
 
-    /// Resets the cell's charge to unknown.
     pub(super) fn forget_charge(&mut self) {
         for j in 0..STATES {
             self.covariance[pair(SOC, j)] = 0.0;
@@ -234,8 +231,8 @@ impl Difference {
     }
 
     /// Updates with a row's mean voltage. Returns true if the cell has changed suddenly, that is, if consecutive rows
-    /// contradict the prediction. In this case the states stay unchanged, and the caller calls [`Self::open`] or
-    /// exchanges the filters of two cells.
+    /// contradict the prediction. The states then stay unchanged, and the caller calls [`Self::open`] or exchanges
+    /// the filters of two cells.
     pub(super) fn observe(&mut self, observed: &Observation) -> bool {
         let off = self.deviations(observed);
         let is_jump = count_odd(&mut self.odd_rows, off, JUMP);
@@ -245,7 +242,6 @@ impl Difference {
         is_jump
     }
 
-    /// Updates with a row's series resistance, which is measured from current steps.
     pub(super) fn observe_steps(&mut self, observed: &Observation) {
         let off = self.deviations(observed);
         if count_odd(&mut self.odd_steps, off, STEPS_JUMP) {
@@ -256,13 +252,11 @@ impl Difference {
         }
     }
 
-    /// Raises the uncertainty of the states after a sudden change, and updates with the row that showed the change.
     pub(super) fn open(&mut self, jump: Jump, observed: &Observation) {
         self.widen_as(jump);
         self.update(observed, 1.0);
     }
 
-    /// Raises the uncertainty of the states because the cell may have changed suddenly.
     pub(super) fn widen_as(&mut self, jump: Jump) {
         self.widen(match jump {
             Jump::Alone => &ALONE_STD,
@@ -300,12 +294,10 @@ impl Difference {
         }
     }
 
-    /// Whether the last row agreed with the prediction.
     pub(super) fn is_settled(&self) -> bool {
         self.odd_rows == 0
     }
 
-    /// Sets the means and resets the count of odd rows.
     pub(super) fn settle(&mut self, mean: &[f64; STATES]) {
         (self.mean, self.odd_rows) = (*mean, 0);
     }
@@ -316,7 +308,6 @@ impl Difference {
         }
     }
 
-    /// Checks the numbers of a stored filter.
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         InvalidState::unless_numbers(
             "a cell's difference from its pack",

@@ -7,9 +7,9 @@ use serde::{Deserialize, Serialize};
 use crate::filter::ScalarGaussian;
 use crate::quantity::{CellIndex, Timestamp};
 
-/// Kind of a finding. Events, reports and the stored state contain the name of the kind. The number of a kind is its
-/// position, counted from 1, in a stored array of each cell. A number therefore never changes and is never reused. The
-/// unit of the finding's size is stated for each kind.
+/// Kind of a finding. Each kind states the unit of the finding's size. Events, reports and the stored state contain
+/// the name of the kind. The number of a kind must never change and never be reused, because it is the position (from
+/// 1) in a stored array.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[repr(u8)]
@@ -166,7 +166,7 @@ impl CellFaultKind {
         }
     }
 
-    /// Whether the voltage measurement of the cell fails, so that nothing is known about the cell.
+    /// Whether the cell's own voltage channel fails. Nothing else is then known about the cell.
     pub const fn is_of_channel(self) -> bool {
         matches!(self, Self::VoltageChannel | Self::VoltageFrozen | Self::DoubledChannels)
     }
@@ -176,8 +176,8 @@ impl CellFaultKind {
         self.is_of_channel() || matches!(self, Self::SwappedChannels)
     }
 
-    /// Magnitude of the size above which a finding of this kind applies, in the unit of the size. 0.5 for kinds whose
-    /// size is not judged here.
+    /// Size (absolute value) above which a finding of this kind applies. The limit does not decide the kinds for
+    /// which it is 0.5.
     pub(super) const fn limit(self) -> f64 {
         match self {
             Self::Leak => LEAK_PER_DAY,

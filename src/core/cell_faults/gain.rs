@@ -15,16 +15,15 @@ use crate::quantity::{DAY_S, InvalidState, Timestamp};
 /// Maximum number of days that are compared with each other. Changes that take longer are caused by the seasons or by
 /// ageing.
 const DAYS: usize = 10;
-/// Time within which the resistances must fall (s). The estimated resistances follow within hours, so two consecutive
-/// daily checks may each see a part of the fall.
+/// Time within which the resistances must fall (s). The estimated resistances follow within hours, so the fall may
+/// spread over two consecutive daily checks.
 const APART_S: f64 = 2.5 * DAY_S;
-/// Standard deviation of changes with other causes than the gain, within `DAYS` days, fraction.
+/// Standard deviation of changes within `DAYS` days that have other causes than the gain, fraction.
 const ERROR: f64 = 0.005;
-/// Maximum relative standard deviation of the capacities (median of the cells) on a day that is compared. Capacities
-/// that are still being learned change too much.
+/// Maximum relative standard deviation of the capacities (median of the cells). A day with a larger value is not
+/// compared, because capacities that are still being learned change too much.
 const KNOWN: f64 = 0.03;
 
-/// Median values of the cells on one day.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Day {
@@ -33,7 +32,6 @@ struct Day {
     log_capacity: f64,
     /// Logarithm of the resistance ratio (cell to model).
     log_resistance: f64,
-    /// Temperature (degrees C).
     temperature_c: f64,
 }
 
@@ -46,17 +44,14 @@ pub struct CellAgeing {
     pub log_resistance: f64,
 }
 
-/// Detector of a risen gain; holds the values of the last days.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Gain {
-    /// Time of the last daily check.
     last: Option<Timestamp>,
     days: Vec<Day>,
 }
 
 impl Gain {
-    /// Whether a day has passed since the last check.
     pub(super) fn is_due(&self, now: Timestamp) -> bool {
         self.last.is_none_or(|last| !(0.0..DAY_S).contains(&now.since(last)))
     }
@@ -96,13 +91,11 @@ impl Gain {
         (probability, size)
     }
 
-    /// Shifts all timestamps by `by_nanos`, to another clock.
     pub(super) fn rebase(&mut self, by_nanos: i64) {
         let stamps = self.days.iter_mut().map(|day| &mut day.time).chain(&mut self.last);
         stamps.for_each(|stamp| *stamp = stamp.plus_nanos(by_nanos));
     }
 
-    /// Checks the numbers of the stored days.
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         let numbers = self.days.iter().flat_map(|day| [day.log_capacity, day.log_resistance, day.temperature_c]);
         InvalidState::unless_numbers("a day of the current's gain", numbers)?;

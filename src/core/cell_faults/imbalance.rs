@@ -1,5 +1,4 @@
-//! Computes how much charge the pack loses because its cells differ: by imbalance and by the weakest cell. Also finds
-//! the cells that limit the pack.
+//! Computes how much charge the pack loses by imbalance and by its weakest cell, and which cells limit the pack.
 //!
 //! In: each cell's difference from the middle of the pack in SOC, capacity and resistance; SOC and capacity of the
 //! middle cell. Out: [`Imbalance`], in fractions of the mean of the cells' capacities. A charge ends when the first
@@ -31,8 +30,8 @@ use crate::cell::CellModel;
 use crate::filter::ScalarGaussian;
 use crate::quantity::{CellIndex, Timestamp};
 
-/// From this standard deviation on, a cell's SOC or capacity counts as unknown. This is half of the standard deviation
-/// before the first row (a few minutes of samples).
+/// If the standard deviation of a cell's SOC or capacity is at least this (fraction), the cell counts as unknown.
+/// These are half of the filter's initial values.
 const UNKNOWN_SOC_STD: f64 = 0.025;
 const UNKNOWN_CAPACITY_STD: f64 = 0.05;
 const OCV_PARTS: u32 = 100;
@@ -46,7 +45,8 @@ pub struct Imbalance {
     pub cells: usize,
     /// Mean of the cells' capacities (Ah).
     pub mean_ah: ScalarGaussian,
-    /// Charge that the pack delivers from the time when its first cell is full until its first cell is empty, fraction.
+    /// Charge that the pack delivers from the time when its first cell is full until its first cell is empty,
+    /// fraction.
     pub usable: ScalarGaussian,
     /// Charge that balancing would recover, fraction.
     pub lost_by_imbalance: ScalarGaussian,
@@ -74,13 +74,12 @@ pub struct Imbalance {
 pub struct LimitingCell {
     /// Index of the cell.
     pub cell: CellIndex,
-    /// Reason that corresponds to the larger of the two causes: SOC or capacity.
+    /// Reason that belongs to the larger of `by_charge` and `by_capacity`.
     pub reason: LimitReason,
-    /// How much less charge this cell delivers (if it is empty first) or accepts (if it is full first) than the mean
-    /// cell because of its SOC, fraction of the mean capacity.
+    /// Charge missing because of the cell's SOC, compared with the mean cell, fraction of the mean capacity. The cell
+    /// cannot deliver this charge (if it is empty first) or cannot accept it (if it is full first).
     pub by_charge: f64,
-    /// How much less charge this cell delivers or accepts than the mean cell because of its capacity, fraction of the
-    /// mean capacity.
+    /// Charge missing because of the cell's capacity, compared with the mean cell, fraction of the mean capacity.
     pub by_capacity: f64,
 }
 
@@ -168,9 +167,6 @@ impl Imbalance {
 
 impl CellFaultDetector {
     /// Computes the imbalance. `middle_ah`: capacity of the middle cell (Ah).
-    ///
-    /// # Errors
-    /// The reason why the imbalance is unknown.
     pub fn imbalance(&self, middle_ah: ScalarGaussian) -> Result<Imbalance, UnknownImbalance> {
         let (time, middle_soc) = self.middle_soc().ok_or(UnknownImbalance::NotCompared)?;
         let (mut known, mut left_out) = (Vec::new(), Vec::new());
@@ -206,17 +202,14 @@ pub fn mean_ocv_v(model: &CellModel, capacity_ah: f64) -> f64 {
     (0..OCV_PARTS).map(ocv_v).sum::<f64>() / f64::from(OCV_PARTS)
 }
 
-/// Differences of a cell from the middle cell.
 #[derive(Debug, Clone, Copy)]
 struct ComparedCell {
     cell: CellIndex,
-    /// Difference in SOC, fraction.
     soc: ScalarGaussian,
     /// Difference in capacity, fraction of the middle cell's capacity.
     capacity: ScalarGaussian,
     /// Difference in resistance, fraction of the middle cell's resistance.
     resistance: ScalarGaussian,
-    /// SOC of the middle cell.
     middle_soc: f64,
     leaks: bool,
     is_weak: bool,
@@ -242,7 +235,6 @@ impl ComparedCell {
         (1.0 - self.own_soc()) * self.capacity()
     }
 
-    /// The reason that corresponds to the larger of the two causes.
     fn reason(&self, by_charge: f64, by_capacity: f64, charge: LimitReason) -> LimitReason {
         match (by_capacity > by_charge, charge) {
             (true, _) if self.is_weak => LimitReason::WeakCell,
@@ -299,7 +291,6 @@ fn imbalance(time: Timestamp, cells: &[ComparedCell], middle_ah: ScalarGaussian)
     }
 }
 
-/// The first cell with the smallest value.
 fn least(cells: &[ComparedCell], value: fn(&ComparedCell) -> f64) -> &ComparedCell {
     cells.iter().fold(&cells[0], |least, it| if value(it) < value(least) { it } else { least })
 }

@@ -1,18 +1,20 @@
 //! Learns the slope of the open-circuit curve from the pack itself.
 //!
-//! In: per row (a few minutes of samples), the middle voltage of the pack without its drop (V), the counted charge, and
-//! the cells' differences. Out: for each tenth of SOC, the factor by which the true slope differs from the slope of the
-//! cell model. All cells share the factors.
+//! In: per row (a few minutes of samples), the pack's middle voltage without its drop (V), the counted charge, and
+//! the cells' differences. Out: for each tenth of SOC, the true slope divided by the slope of the cell model. All
+//! cells share these factors.
 //!
-//! The slope is learned while the cell model is the model of a label. The curve of a label can have half or twice the
-//! slope of the real curve. A constant difference in charge then looks like a difference that depends on the SOC, and
-//! the comparison of cells would explain it by a contact or a lost capacity. The pack shows its own slope in two ways:
-//! * the change of its middle voltage, divided by the charge that moved;
-//! * cells with different charge: all their voltage differences grow and shrink with the same slope. This gives the
-//!   slope in one tenth relative to another tenth, but no scale, because the charges themselves are learned with it.
+//! The slope is learned while the cell model is derived from a label (chemistry and capacity). Such a curve can have
+//! half or twice the slope of the real curve. A constant difference in charge then looks like a difference that
+//! depends on the SOC. The comparison of cells would explain it by a bad contact or a lost capacity.
 //!
-//! The factor of a tenth is the relative slope from the cells, scaled to agree with the middle voltage in all tenths
-//! together. In a tenth without cells of different charge, it is the slope from the middle voltage.
+//! The pack shows its own slope in two ways:
+//! * From the middle voltage: its change, divided by the charge that moved.
+//! * From cells with different charge: their voltage differences grow and shrink with the slope. This gives only the
+//!   ratio of the slopes in two tenths, because the charge differences themselves are still being learned.
+//!
+//! The factor of a tenth is the slope from the cells, scaled so that it agrees with the middle voltage over all
+//! tenths. In a tenth without cells of different charge, it is the slope from the middle voltage.
 
 use serde::{Deserialize, Serialize};
 
@@ -23,47 +25,48 @@ use crate::quantity::InvalidState;
 const TENTHS: usize = 10;
 /// Standard deviation of the factor before the first measurement.
 const LABEL_STD: f64 = 0.4;
-/// Standard deviations that decide where on the curve a row is: of the filter's SOC, fraction, and of the open-circuit
-/// voltage (V). On a steep curve, the voltage decides; on a flat curve, the SOC.
+/// Standard deviations that decide where on the curve a row is: `SOC_STD` of the filter's SOC (fraction), `OCV_STD_V`
+/// of the open-circuit voltage (V). On a steep curve, the voltage decides. On a flat curve, the SOC decides.
 const SOC_STD: f64 = 0.05;
 const OCV_STD_V: f64 = 0.01;
-/// Smallest relative standard deviations of a slope. `LEAST_STD` is that of the middle voltage, because the voltage drop
-/// also changes with the SOC. `LEAST_STD_OF_CELLS` is that of the cells, because the slope varies within a tenth.
+/// Minimum relative standard deviations of a slope. `LEAST_STD` applies to the middle voltage, because the voltage
+/// drop also changes with the SOC. `LEAST_STD_OF_CELLS` applies to the cells, because the slope varies within a
+/// tenth.
 const LEAST_STD: f64 = 0.2;
 const LEAST_STD_OF_CELLS: f64 = 0.1;
-/// Up to this relative standard deviation, the slope from the cells is used.
+/// Maximum relative standard deviation at which the slope from the cells is used.
 const SEEN_STD: f64 = 0.2;
-/// Variance of the logarithm of the slope from the cells before the first row.
+/// Initial variance of the logarithm of the slope from the cells.
 const FIRST_VARIANCE: f64 = 1.0;
-/// Smallest charge difference of a cell that shows the slope, fraction. With a smaller one, offsets of the voltage
+/// Minimum charge difference of a cell that is used, fraction. With smaller differences, offsets of the voltage
 /// channels would look like a slope.
 const LEAST_CHARGE: f64 = 0.005;
-/// Largest part of the charge differences that one cell may have. Otherwise, a fault of this cell could look like a
-/// slope.
+/// Maximum part of one cell in the sum of the charge differences. With a larger part, a fault of this cell could look
+/// like a slope.
 const MOST_OF_ONE: f64 = 1.0 / 3.0;
-/// Errors of the slope from the cells. `CELL_V` is the error of each cell's voltage difference (V), the same in every
-/// row. `CELLS` is the error of one row, fraction: the charge differences are still being learned.
+/// Errors of the slope from the cells. `CELL_V`: error of each cell's voltage difference, equal in every row (V).
+/// `CELLS`: error of one row (fraction), because the charge differences are still being learned.
 const CELL_V: f64 = 0.004;
 const CELLS: f64 = 0.3;
-/// Allowed values of a factor.
 const FACTORS: (f64, f64) = (0.2, 4.0);
-/// Number of recent rows that are kept. The change of the voltage is measured between the newest row and one of them.
+/// Number of recent rows kept. The voltage change is measured between the newest row and a kept row.
 const RECENT: usize = 24;
-/// Allowed distance in SOC between the two rows. A smaller distance has a larger error, a larger one blurs the tenths.
+/// Allowed SOC change between the two rows of a measurement. A smaller change has a larger error. A larger change
+/// blurs the tenths.
 const APART: (f64, f64) = (0.03, 0.12);
-/// Errors of the change of the open-circuit voltage: `ROW_V` of each row (V), and `DROP` of the change of the voltage
-/// drop, fraction.
+/// Errors of the change of the open-circuit voltage: `ROW_V` of each row (V), `DROP` as a fraction of the change of
+/// the voltage drop.
 const ROW_V: f64 = 0.004;
 const DROP: f64 = 0.3;
-/// Number of consecutive measurements that share about the same rows.
+/// Number of consecutive measurements that share about the same rows. Their errors are not independent.
 const SHARED: f64 = 3.0;
-/// If a measurement differs by more than this many standard deviations, its weight is reduced (Huber).
+/// Number of standard deviations above which the weight of a measurement is reduced (Huber).
 const HUBER: f64 = 3.0;
-/// Largest number of rows by which [`PackSlope::factor`] multiplies the variance of a factor. Older rows hardly
+/// Maximum number of rows by which [`PackSlope::factor`] multiplies the variance of a factor. Older rows hardly
 /// influence the filter of a cell.
 const MOST_ROWS: u32 = 200;
 
-/// A row, as far as the slope is concerned.
+/// Values of a row from which the slope is learned.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub(super) struct SlopeRow {
     /// Charge taken out since any fixed time (Ah).
@@ -72,7 +75,6 @@ pub(super) struct SlopeRow {
     pub(super) soc: f64,
     /// Middle voltage of the pack plus its voltage drop (V).
     pub(super) ocv_v: f64,
-    /// Voltage drop (V).
     pub(super) drop_v: f64,
 }
 
@@ -80,11 +82,10 @@ pub(super) struct SlopeRow {
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct PackSlope {
-    /// Empty before the first row.
     tenths: Vec<Tenth>,
     /// The latest rows since the last gap, oldest first.
     recent: Vec<SlopeRow>,
-    /// Voltages of the model's curve to which the factors refer (V).
+    /// Voltages of the model at SOC 0.3 and 0.7 (V). If they change, everything learned is discarded.
     curve_v: [f64; 2],
 }
 
@@ -92,11 +93,11 @@ pub(super) struct PackSlope {
 struct Tenth {
     /// Factor from the middle voltage.
     of_middle: ScalarGaussian,
-    /// Logarithm of the mean charge difference of the cells that the model's slope would give (fraction). This
-    /// difference is proportional to the true slope divided by the model's slope. `None` before the first row with
-    /// cells of different charge.
+    /// Logarithm of the cells' mean charge difference (fraction), computed from their voltages with the model's
+    /// slope. The charge difference computed in this way is proportional to the factor. `None` before the first row
+    /// with cells of different charge.
     of_cells: Option<ScalarGaussian>,
-    /// Number of rows with this factor.
+    /// Number of rows in this tenth.
     rows: u32,
 }
 
@@ -110,13 +111,12 @@ impl PackSlope {
         self.recent.clear();
     }
 
-    /// Discards everything learned.
     pub(super) fn forget(&mut self) {
         *self = Self::default();
     }
 
-    /// SOC of the row on the model's curve. `soc`: SOC of the middle cell in the filter, which may be wrong by several
-    /// points while the model comes from a label.
+    /// SOC of the row on the model's curve. `soc`: SOC of the middle cell in the filter, which may be wrong by
+    /// several points while the model is derived from a label.
     pub(super) fn position(model: &CellModel, capacity_ah: f64, temperature_c: f64, soc: f64, ocv_v: f64) -> f64 {
         let temperature = model.temperature_position(temperature_c);
         let slope_v = model.ocv_slope_v(&model.grid_position_at(&temperature, soc.clamp(0.0, 1.0)), capacity_ah);
@@ -126,7 +126,7 @@ impl PackSlope {
         soc + weight * (by_voltage - soc)
     }
 
-    /// Adds a row and measures the slope between this row and a recent one.
+    /// Adds a row and measures the slope between this row and a recent row.
     pub(super) fn add(&mut self, model: &CellModel, capacity_ah: f64, temperature_c: f64, row: SlopeRow) {
         let curve_v = [0.3, 0.7].map(|soc| model.ocv_v(&model.grid_position(soc, 25.0)));
         if self.tenths.is_empty() || self.curve_v != curve_v {
@@ -167,9 +167,9 @@ impl PackSlope {
         busiest.map_or(0.5, |tenth| (tenth as f64 + 0.5) / TENTHS as f64)
     }
 
-    /// Learns the slope at `soc` from several cells. `cells`: per cell, its charge difference at the reference SOC
-    /// (fraction), and its voltage difference as a multiple of the difference that the model computes for this charge.
-    /// `slope_v`: slope of the model (V per unit of SOC).
+    /// Learns the slope at `soc` from several cells. `slope_v`: slope of the model (V per unit of SOC). `cells`
+    /// contains two values per cell: its charge difference at the reference SOC (fraction), and its voltage
+    /// difference divided by the model's voltage difference for this charge.
     pub(super) fn learn_from_cells(&mut self, soc: f64, slope_v: f64, mut cells: Vec<(f64, f64)>) {
         let Some(tenth) = self.tenths.get_mut(tenth(soc)) else { return };
         let mean_charge = cells.iter().map(|(charge, _)| charge.abs()).sum::<f64>() / cells.len().max(1) as f64;
@@ -187,7 +187,7 @@ impl PackSlope {
         let squares: f64 = cells.iter().map(|(charge, _)| charge * charge).sum();
         // The channels of the cells have the same offsets in every row.
         let lasting = CELL_V * CELL_V / (slope_v * slope_v * squares);
-        // The mean charge makes the value independent of the scale of the charges, which are still being learned.
+        // The mean charge cancels the unknown scale of the charge differences.
         let measured = libm::log(median.map_or(0.0, |(_, multiple)| multiple * mean_charge));
         if measured.is_finite() && lasting <= FIRST_VARIANCE {
             let before = tenth.of_cells.unwrap_or(ScalarGaussian { mean: measured, variance: FIRST_VARIANCE });
@@ -197,8 +197,8 @@ impl PackSlope {
         }
     }
 
-    /// Factor of the slope per unit of `of_cells`, so that both ways agree on the whole rise of the curve. `None` if no
-    /// tenth shows the slope in both ways.
+    /// Factor that scales the slopes from the cells, so that their sum equals the sum of the slopes from the middle
+    /// voltage. `None` if no tenth has both slopes.
     fn scale(&self) -> Option<f64> {
         let seen = || {
             self.tenths.iter().filter_map(|tenth| Some((tenth.of_middle.mean, libm::exp(tenth.clear_of_cells()?.mean))))
@@ -207,11 +207,11 @@ impl PackSlope {
         (of_cells > 0.0).then(|| of_middle / of_cells)
     }
 
-    /// Factor of the slope at a SOC, and variance of its error in one of many rows.
+    /// Factor of the slope at a SOC, and variance of its error in a single row.
     ///
-    /// All rows of a tenth share the factor's error, but the filter of a cell treats the errors of rows as independent.
-    /// With the error's variance times the number of rows, all rows of a tenth together contain as much information as
-    /// one row with the error's variance.
+    /// All rows of a tenth share the factor's error, but the filter of a cell treats the errors of rows as
+    /// independent. The variance is therefore multiplied by the number of rows. All rows of a tenth together then
+    /// count as one row.
     pub(super) fn factor(&self, soc: f64) -> ScalarGaussian {
         let Some(tenth) = self.tenths.get(tenth(soc)) else { return ScalarGaussian { mean: 1.0, variance: 0.0 } };
         let scaled = |(scale, of_cells): (f64, ScalarGaussian)| {
@@ -223,7 +223,6 @@ impl PackSlope {
         ScalarGaussian { mean, variance: variance * f64::from(tenth.rows.max(1)) }
     }
 
-    /// Checks the numbers of a stored state.
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         let count = self.tenths.len();
         let is_possible = (count == 0 || count == TENTHS) && self.recent.len() <= RECENT;
@@ -242,7 +241,7 @@ impl PackSlope {
 }
 
 impl Tenth {
-    /// What the cells show, if they show it clearly.
+    /// The slope from the cells, if it is certain enough.
     fn clear_of_cells(&self) -> Option<ScalarGaussian> {
         self.of_cells.filter(|it| it.variance <= SEEN_STD * SEEN_STD)
     }
@@ -266,8 +265,8 @@ mod tests {
         Label::usual(chemistry, 100.0).model().expect("a model")
     }
 
-    /// The slope after 30 rows at a SOC of 0.35 and 30 rows at 0.75, in which the voltages of six cells differ by half
-    /// and by one and a half of the model's difference. No charge moves.
+    /// The slope after 30 rows at a SOC of 0.35 and 30 rows at 0.75. In these rows, the voltages of six cells differ
+    /// by 0.5 and 1.5 times the model's difference. No charge moves.
     fn seen(model: &CellModel) -> PackSlope {
         let mut slope = PackSlope::default();
         for (soc, multiple) in [(0.35, 0.5), (0.75, 1.5)] {

@@ -4,33 +4,29 @@ use serde::{Deserialize, Serialize};
 
 use crate::quantity::Timestamp;
 
-/// A voltage was not read again if it is the same bit for bit although its drop has changed by more than `REPEATED_V`
-/// (V). After `REPEATED_S` (s), a repeated voltage counts again: the channel may be frozen.
+/// If a voltage is equal bit for bit although its drop has changed by more than `REPEATED_V` (V), it counts as
+/// repeated, not as read again. After `REPEATED_S` (s), it counts as read, because the channel may be frozen.
 const REPEATED_V: f64 = 0.005;
 const REPEATED_S: f64 = 30.0;
 
-/// Sums of one cell over a row.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(super) struct CellSums {
     pub(super) count: u32,
-    /// Number of voltages in the sum: a voltage that was not read again is not added.
+    /// Number of voltages in the sum. Repeated voltages are not added.
     readings: u32,
-    /// Sum of the voltages. Because the cells are sampled at different times, each voltage is corrected by the mean
+    /// Sum of the voltages. The cells are sampled at different times. Each voltage is therefore corrected by the mean
     /// cell's ohmic drop at the current of the sample.
     voltage_v: f64,
-    /// Sum of the squared current steps between samples.
     steps_a2: f64,
     /// Sum of the products of current step and voltage step between samples.
     steps_va: f64,
-    /// Time, voltage and current of the previous sample that was read anew.
+    /// Time, voltage and current of the previous sample whose voltage was not repeated.
     last: Option<(Timestamp, f64, f64)>,
-    /// Time of the previous sample.
     seen: Option<Timestamp>,
     temperature_c: f64,
     temperatures: u32,
     /// Hash of the sequence of voltages in the row.
     pub(super) digest: u64,
-    /// Number of voltage changes.
     pub(super) changes: u32,
 }
 
@@ -76,12 +72,10 @@ impl CellSums {
         }
     }
 
-    /// Mean voltage (V); `None` if the row has no sample.
     pub(super) fn mean_v(&self) -> Option<f64> {
         (self.readings > 0).then(|| self.voltage_v / f64::from(self.readings))
     }
 
-    /// Mean temperature (degrees C); `None` if it was not measured.
     pub(super) fn mean_c(&self) -> Option<f64> {
         (self.temperatures > 0).then(|| self.temperature_c / f64::from(self.temperatures))
     }
@@ -92,12 +86,10 @@ impl CellSums {
         (self.steps_a2 >= least_a2).then(|| (-self.steps_va / self.steps_a2, self.steps_a2))
     }
 
-    /// Starts the next row.
     pub(super) fn begin(&mut self) {
         *self = Self { last: self.last, seen: self.seen, ..Self::default() };
     }
 
-    /// Discards the samples of the present row, because the next sample follows a gap.
     pub(super) fn interrupt(&mut self) {
         *self = Self::default();
     }
@@ -108,7 +100,6 @@ impl CellSums {
     }
 }
 
-/// Sums of the pack over a row.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(super) struct PackSums {
     pub(super) begun: Option<Timestamp>,

@@ -6,7 +6,7 @@
 
 use serde::{Deserialize, Serialize};
 
-/// A sensor is judged only if the sum of the pack's squared warmings is at least this, K^2.
+/// Minimum sum of the pack's squared warmings (K^2). With a smaller sum, no sensor is judged.
 const LEAST_K2: f64 = 30.0;
 /// A sensor counts as detached if it shows less than the fraction `DETACHED` of the pack's warming. A detached sensor
 /// counts as attached again if it shows more than the fraction `ATTACHED`.
@@ -18,9 +18,7 @@ const ATTACHED: f64 = 0.6;
 pub(super) struct WarmingRatio {
     /// Slow mean of the temperature (degrees C).
     slow_c: Option<f64>,
-    /// Sum of the pack's squared warmings, K^2.
     squares_k2: f64,
-    /// Sum of the products of the pack's warming and the warming at this cell, K^2.
     products_k2: f64,
     pub(super) is_detached: bool,
 }
@@ -35,7 +33,6 @@ impl WarmingRatio {
         here_c - *slow_c
     }
 
-    /// Compares the warming at a cell with the median warming of the pack in the same row.
     pub(super) fn compare(&mut self, seconds: f64, middle_k: f64, here_k: f64) {
         // The weight of a row halves every five days.
         let older = libm::exp2(-seconds.max(0.0) / (5.0 * 86_400.0));

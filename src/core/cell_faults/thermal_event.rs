@@ -1,18 +1,21 @@
 //! Detects a thermal event: the voltage of a cell collapses, or a temperature rises faster than the current explains.
 //!
-//! In: readings of cell voltages (V) and temperatures (degrees C) before the plausibility checks, because a thermal
-//! runaway changes them faster than plausible. Out: for each cell, whether there is evidence of a thermal event.
+//! In: readings of cell voltages (V) and temperatures (degrees C). The readings have not passed the plausibility
+//! checks, because a thermal runaway changes them faster than plausible. Out: for each cell, whether there is
+//! evidence of a thermal event.
 //!
-//! * **Collapse**: within half a minute, the voltage has fallen by [`FALL`], and by [`FALL`] more than the median of the other
-//!   cells. At least [`LEAST_READINGS`] readings in [`LEAST_S`] show it. The drop that the current explains is deducted.
-//!   A cell that may be almost empty is not judged, because its voltage can fall as fast. A broken sense wire raises the
-//!   voltage of a neighbour, and a dead channel repeats one value; neither counts.
-//! * **Heating**: a temperature rises by [`RATE_C_PER_S`] for [`LEAST_S`], or by [`AHEAD_C`] more than the median of the
-//!   other sensors within [`WINDOW_S`]. The rise that the current explains is deducted. A second reading, [`LEAST_S`]
-//!   later, must confirm it. A cell of the sensor is named: the cell whose voltage has fallen most.
+//! * **Collapse**: within half a minute, the voltage of a cell falls by the fraction [`FALL`]. It must also fall by
+//!   [`FALL`] more than the median of the other cells. At least [`LEAST_READINGS`] readings over [`LEAST_S`] show the
+//!   fall. The drop that the current explains is deducted. If a cell may be almost empty, it is not judged, because
+//!   its voltage can fall as fast. Two faults do not count: a broken sense wire, which raises the voltage of a
+//!   neighbour, and a dead channel, which repeats one value.
+//! * **Heating**: a temperature rises by [`RATE_C_PER_S`] for [`LEAST_S`], or within [`WINDOW_S`] by [`AHEAD_C`] more
+//!   than the median of the other sensors. The rise that the current explains is deducted. A second reading,
+//!   [`LEAST_S`] later, must confirm the rise. Of the sensor's cells, the finding names the cell whose voltage has
+//!   fallen most.
 //!
-//! The first minute after a break is not judged. The limits of voltage, rate and duration are those by which GB 38031
-//! (appendix C) confirms a thermal runaway.
+//! The first minute after a gap in the readings is not judged. [`FALL`], [`RATE_C_PER_S`] and [`LEAST_S`] are the
+//! limits at which GB 38031 (appendix C) confirms a thermal runaway.
 
 use std::collections::VecDeque;
 
@@ -21,46 +24,49 @@ use serde::{Deserialize, Serialize};
 use crate::filter::{median, square};
 use crate::quantity::{CellIndex, InvalidState, SensorIndex, Timestamp};
 
-/// Smallest fall of a voltage, as a fraction of the voltage before (GB 38031, appendix C).
+/// Minimum fall of a voltage, as a fraction of the earlier voltage (GB 38031, appendix C).
 const FALL: f64 = 0.25;
-/// Smallest rate of a temperature without a comparison (degrees C/s; GB 38031, appendix C).
+/// Minimum rate of a temperature rise that counts without comparison to other sensors (degrees C/s; GB 38031,
+/// appendix C).
 const RATE_C_PER_S: f64 = 1.0;
-/// Shortest duration of a fall or rise (s; GB 38031, appendix C).
+/// Minimum duration of a fall or rise (s; GB 38031, appendix C).
 const LEAST_S: f64 = 3.0;
-/// Least number of readings that show a fall, and of steps in which a temperature rises.
+/// Minimum number of readings that show a fall, and of steps in which a temperature rises.
 const LEAST_READINGS: u32 = 3;
-/// Lead of a temperature over the median of the other sensors (degrees C).
+/// Minimum lead of a temperature rise over the median rise of the other sensors (degrees C).
 const AHEAD_C: f64 = 10.0;
-/// Longest time over which a fall or rise is judged (s).
+/// Maximum time over which a fall or rise is judged (s).
 const WINDOW_S: f64 = 120.0;
-/// Drop that a current of 1 C explains (V): the drop of a good cell is a fifth of it.
+/// Voltage drop that a current change of 1 C explains (V). The drop of a good cell is a fifth of this value.
 const EXPLAINED_V: f64 = 0.5;
-/// Highest voltage of a sound cell relative to the median of the other cells.
+/// Maximum voltage of a sound cell relative to the median of the other cells.
 const HIGHEST_SHARE: f64 = 1.1;
-/// Initial rate at which a sensor warms with a current of 1 C (degrees C/s). Cells and busbars heat with the square of
-/// the current.
+/// Initial rate at which a current of 1 C warms a sensor (degrees C/s). Cells and busbars heat with the square of the
+/// current.
 const EXPLAINED_C_PER_S: f64 = 0.1;
-/// Largest rise with a current of 1 C (degrees C).
+/// Maximum rise with a current of 1 C (degrees C).
 const EXPLAINED_C: f64 = 5.0;
-/// Largest difference between the rises of two sensors with a current of 1 C (degrees C).
+/// Maximum difference between the rises of two sensors with a current of 1 C (degrees C).
 const EXPLAINED_DIFFERENCE_C: f64 = 1.0;
-/// Time over which the square of the current is averaged (s). A busbar cools in about a minute.
+/// Time constant with which the square of the current is averaged (s). A busbar cools in about a minute.
 const HEAT_S: f64 = 60.0;
-/// Current that counts while the current is unknown (1/h).
+/// Assumed current while the current is unknown (1/h).
 const UNKNOWN_RATE_PER_H: f64 = 1.0;
-/// Time between two references of a voltage, and between two refreshes of the values (s).
+/// Time between two refreshes, which take reference voltages and update the published values (s).
 const REFRESH_S: f64 = 30.0;
-/// A temperature is not judged for this long after its first reading (s), because the filter of its sensor settles.
+/// After its first reading, a temperature is not judged for this long (s), because the filter of its sensor is
+/// settling.
 const SETTLE_S: f64 = 60.0;
-/// A cell cannot cool by more than this between two readings (degrees C) at more than this rate (degrees C/s).
+/// If a temperature falls by more than this between two readings (degrees C) at more than this rate (degrees C/s),
+/// its sensor has failed. No cell cools so fast.
 const IMPOSSIBLE_FALL: (f64, f64) = (5.0, 0.5);
-/// Longest time for which a failed sensor must exceed what it showed before the failure (s).
+/// Maximum time for which a failed sensor must exceed the temperature that it showed before the failure (s).
 const FLOOR_S: f64 = 3600.0;
 /// Evidence lasts this long after the last reading that shows it (s).
 const HOLD_S: f64 = 60.0;
-/// A cell whose SOC may be below this is not judged by its voltage.
+/// If the SOC of a cell may be below this, the cell's voltage is not judged.
 const ALMOST_EMPTY: f64 = 0.1;
-/// Shortest distance between the readings of a trail (s), and their number.
+/// Kept readings of a sensor: minimum time between two readings (s), and maximum number of readings.
 const FAST: (f64, usize) = (0.5, 8);
 const SLOW: (f64, usize) = (10.0, 13);
 
@@ -70,7 +76,7 @@ const SLOW: (f64, usize) = (10.0, 13);
 pub struct ThermalWatch {
     cells: Vec<CellState>,
     sensors: Vec<SensorState>,
-    /// Number of cells with a fall.
+    /// Number of cells whose voltage is far below its reference.
     falling: usize,
     refreshed: Option<Timestamp>,
 }
@@ -78,7 +84,6 @@ pub struct ThermalWatch {
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct CellState {
-    /// Latest voltage (V).
     latest: Option<(Timestamp, f64)>,
     /// Whether a voltage has arrived since the last refresh.
     is_fresh: bool,
@@ -87,7 +92,7 @@ struct CellState {
     /// Whether the cell may have been almost empty at the last refresh.
     may_be_empty: bool,
     fall: Option<Fall>,
-    /// Until when there is evidence.
+    /// End of the evidence of a collapse.
     collapsed_until: Option<Timestamp>,
     heating_until: Option<Timestamp>,
 }
@@ -97,7 +102,7 @@ struct CellState {
 #[serde(deny_unknown_fields)]
 struct Reference {
     voltage_v: f64,
-    /// Current at that time (1/h); `None` = unknown.
+    /// Current at the time of the voltage (1/h); `None` = unknown.
     rate_per_h: Option<f64>,
 }
 
@@ -115,25 +120,25 @@ struct Fall {
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct SensorState {
-    /// Time of the first reading after a break.
+    /// Time of the first reading since the start or a gap.
     first: Option<Timestamp>,
     latest: Option<(Timestamp, f64)>,
     floor: Option<Floor>,
     fast: Trail,
     slow: Trail,
-    /// Mean square of the current (1/h^2).
     heat: f64,
-    /// A reading that showed a rise and has not been confirmed.
+    /// A reading that showed a rise and still needs confirmation.
     shown: Option<(Timestamp, f64)>,
 }
 
-/// What a sensor showed before it failed. Until the sensor has returned, only a rise above this temperature counts.
+/// Temperature that a sensor showed before it failed. Until the sensor has recovered, only a rise above this value
+/// counts.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Floor {
     since: Timestamp,
     temperature_c: f64,
-    /// Since when the readings are near the floor or above it.
+    /// Since when the readings have been near or above this temperature.
     returned: Option<Timestamp>,
 }
 
@@ -142,7 +147,8 @@ struct Floor {
 struct Trail(VecDeque<(Timestamp, f64)>);
 
 impl Trail {
-    /// Adds a reading if it is far enough from the last one, and drops what is too old.
+    /// Adds a reading if the previous one is at least `spacing_s` old. Removes readings that are older than
+    /// [`WINDOW_S`].
     fn add(&mut self, now: Timestamp, value: f64, (spacing_s, length): (f64, usize)) {
         while self.0.front().is_some_and(|(time, _)| !(0.0..=WINDOW_S).contains(&now.since(*time))) {
             self.0.pop_front();
@@ -155,8 +161,9 @@ impl Trail {
         }
     }
 
-    /// The rise up to `value` since each reading since which the temperature has only risen, in at least
-    /// [`LEAST_READINGS`] steps. The largest step does not count, because it may be a disturbance.
+    /// Rises from earlier readings to `value`. An earlier reading counts if the temperature has not fallen since
+    /// then, and has risen in at least [`LEAST_READINGS`] steps. The largest step is left out, because it may be a
+    /// disturbance.
     fn rises(&self, now: Timestamp, value: f64) -> impl Iterator<Item = Rise> + '_ {
         let (mut next, mut steps, mut largest) = ((now, value), 0, (0.0, 0.0));
         let rises = self.0.iter().rev().map_while(move |&(time, earlier)| {
@@ -178,7 +185,6 @@ impl Trail {
         self.0.iter().find(|(at, _)| *at >= time).map(|(_, value)| *value)
     }
 
-    /// Whether a rise can be judged.
     fn has_enough(&self, now: Timestamp) -> bool {
         let recent = self.0.iter().filter(|(at, _)| now.since(*at) <= WINDOW_S);
         recent.count() > LEAST_READINGS as usize
@@ -194,25 +200,23 @@ impl Trail {
 struct Rise {
     /// Time since the rise began (s).
     age_s: f64,
-    /// Time of the steps that count (s).
+    /// Duration of the rise without its largest step (s).
     seconds: f64,
     rise_c: f64,
 }
 
-/// Rises that the current explains.
 #[derive(Debug, Clone, Copy)]
 struct Heat {
-    /// Mean square of the current (1/h^2).
     square_per_h2: f64,
 }
 
 impl Heat {
-    /// Rise of a sensor in a time (degrees C).
+    /// Rise of a sensor that the current explains within `age_s` (degrees C).
     fn explained_c(self, age_s: f64) -> f64 {
         self.square_per_h2 * (EXPLAINED_C_PER_S * age_s).min(EXPLAINED_C)
     }
 
-    /// Difference between the rises of two sensors (degrees C).
+    /// Difference between the rises of two sensors that the current explains (degrees C).
     fn explained_difference_c(self) -> f64 {
         self.square_per_h2 * EXPLAINED_DIFFERENCE_C
     }
@@ -227,7 +231,7 @@ impl ThermalWatch {
         Self { cells: vec![CellState::default(); cells], sensors, ..Self::default() }
     }
 
-    /// Forgets the readings, because no reading follows for a while. Evidence ends.
+    /// Discards the readings and the evidence, because a gap in the readings follows.
     pub fn interrupt(&mut self) {
         *self = Self::new(self.cells.len(), self.sensors.len());
     }
@@ -278,7 +282,6 @@ impl ThermalWatch {
         self.handle_fallen(now, cell.index(), voltage_v, rate_per_h())
     }
 
-    /// Handles a voltage that is far below its reference.
     #[cold]
     fn handle_fallen(&mut self, now: Timestamp, cell: usize, voltage_v: f64, rate_per_h: Option<f64>) -> bool {
         let state = &mut self.cells[cell];
@@ -298,8 +301,8 @@ impl ThermalWatch {
         !was_known
     }
 
-    /// Whether the voltage of a cell has fallen more than the current and the other cells explain, without a rise of a
-    /// neighbour's voltage.
+    /// Whether the voltage of this cell alone has fallen. True if it has fallen more than the current and the other
+    /// cells explain, and no neighbour's voltage has risen.
     fn is_alone(&self, cell: usize, rate_per_h: Option<f64>) -> bool {
         let others = || self.cells.iter().enumerate().filter(|(index, _)| *index != cell).map(|(_, other)| other);
         let shares: Vec<f64> = others().filter_map(CellState::share_left).collect();
@@ -314,7 +317,7 @@ impl ThermalWatch {
         };
         let changes = own.references.iter().flatten().map(|reference| change(reference.rate_per_h));
         let explained_v = EXPLAINED_V * changes.fold(0.0, f64::max);
-        // A higher reference was no voltage of the cell.
+        // A higher reference cannot be the voltage of the cell.
         let share = (latest_v + explained_v) / reference_v.min(HIGHEST_SHARE * middle_v);
         let is_sound = |neighbour: &CellState| {
             let has_reported = neighbour.latest.is_some_and(|(at, _)| at >= fall.since);
@@ -361,8 +364,8 @@ impl ThermalWatch {
         named.is_none().then(|| CellIndex(u16::try_from(cell).unwrap_or(u16::MAX)))
     }
 
-    /// Whether a temperature rises faster than the current and the other sensors explain, above what the sensor showed
-    /// before a failure.
+    /// Whether a temperature rises faster than the current and the other sensors explain. After a failure of the
+    /// sensor, the temperature must also exceed the value before the failure.
     fn is_rising(&self, now: Timestamp, sensor: usize, temperature_c: f64, heat: Heat) -> bool {
         let state = &self.sensors[sensor];
         let floor_c = state.floor.map_or(f64::NEG_INFINITY, |floor| floor.temperature_c);
@@ -379,7 +382,8 @@ impl ThermalWatch {
         (fast.any(is_fast) || slow.any(is_ahead)) && !self.is_behind_others(now, sensor, temperature_c)
     }
 
-    /// Whether a temperature is below the median of the other sensors, as that of a sensor that returns from a failure.
+    /// Whether a temperature is below the median of the other sensors. Such a sensor may be recovering from a
+    /// failure.
     fn is_behind_others(&self, now: Timestamp, sensor: usize, temperature_c: f64) -> bool {
         let others = self.sensors.iter().enumerate().filter(|(index, _)| *index != sensor);
         let latest = others.filter_map(|(_, other)| other.fast.0.back().filter(|(at, _)| now.since(*at) <= WINDOW_S));
@@ -387,7 +391,8 @@ impl ThermalWatch {
         latest.len() > 1 && median(latest.iter().copied()).is_some_and(|middle| temperature_c < middle)
     }
 
-    /// Median rise of the other sensors in the last `age_s` (degrees C), at least 0; `None` without two other sensors.
+    /// Median rise of the other sensors in the last `age_s` (degrees C), at least 0. `None` if there are fewer than
+    /// two.
     fn rise_of_others(&self, now: Timestamp, sensor: usize, age_s: f64) -> Option<f64> {
         let since = now.plus_secs(-age_s);
         let others = self.sensors.iter().enumerate().filter(|(index, _)| *index != sensor);
@@ -399,8 +404,9 @@ impl ThermalWatch {
         median(rises.iter().copied()).filter(|_| rises.len() > 1).map(|rise| rise.max(0.0))
     }
 
-    /// Takes new references if they are due. `rate_per_h`: current of a cell relative to its rated capacity; `least_soc`:
-    /// lower bound of a cell's SOC; `None` = unknown. Returns whether new values are to be published.
+    /// Takes new references if they are due. `rate_per_h`: current of a cell relative to its rated capacity;
+    /// `least_soc`: lower bound of a cell's SOC; `None` = unknown. Returns whether the caller should publish new
+    /// values.
     pub fn refresh(
         &mut self,
         now: Timestamp,
@@ -415,7 +421,7 @@ impl ThermalWatch {
             |cell: &CellState| cell.fall.is_some_and(|fall| (0.0..WINDOW_S).contains(&now.since(fall.since)));
         let judged: Vec<bool> = self.cells.iter().map(is_judged).collect();
         for (index, cell) in self.cells.iter_mut().enumerate() {
-            // As long as a fall is judged, neither its voltage nor those of its neighbours are references.
+            // While a fall is judged, the cell and its neighbours keep their references.
             let around = index.saturating_sub(1)..judged.len().min(index + 2);
             if judged[around].contains(&true) {
                 continue;
@@ -430,8 +436,8 @@ impl ThermalWatch {
         true
     }
 
-    /// Evidence for each cell: 0 = none, 1 = its voltage has collapsed, 2 = its temperature rises, 3 = both; `None` =
-    /// neither its voltage nor a temperature can be judged. `sensors`: the temperature sensor of each cell.
+    /// Evidence for each cell: 0 = none, 1 = its voltage has collapsed, 2 = its temperature rises, 3 = both. `None`
+    /// if neither its voltage nor its temperature can be judged. `sensors`: the temperature sensor of each cell.
     pub fn evidence(
         &self,
         now: Timestamp,
@@ -454,13 +460,14 @@ impl ThermalWatch {
 }
 
 impl SensorState {
-    /// Notes the latest reading. If the sensor has failed since the last one, or was silent, the judgement begins again.
+    /// Stores the latest reading. If the sensor failed or was silent before this reading, sets the floor: the
+    /// temperature before the failure. Removes the floor after the sensor has recovered.
     fn note_failure(&mut self, now: Timestamp, temperature_c: f64, elapsed_s: f64) {
         let (least_c, rate_c_per_s) = IMPOSSIBLE_FALL;
         if let Some((_, before_c)) = self.latest.replace((now, temperature_c)) {
             let fall_c = before_c - temperature_c;
             if (fall_c > least_c && fall_c > rate_c_per_s * elapsed_s) || elapsed_s > SETTLE_S {
-                // The median: the latest reading may be a disturbance far above the temperature.
+                // Use the median, because the latest reading may be a disturbance far above the temperature.
                 let usual_c = median(self.slow.0.iter().map(|(_, value)| *value));
                 let floor_c = usual_c.into_iter().chain(self.floor.map(|floor| floor.temperature_c)).reduce(f64::max);
                 self.floor = floor_c.map(|temperature_c| Floor { since: now, temperature_c, returned: None });
@@ -478,13 +485,12 @@ impl SensorState {
 }
 
 impl CellState {
-    /// The lower of the last two references, so that one disturbed reading counts for nothing; `None` in the first minute.
+    /// The lower of the last two references, so that a single high reading has no effect. `None` in the first minute.
     fn reference_v(&self) -> Option<f64> {
         let [before_v, last_v] = self.references.map(|reference| Some(reference?.voltage_v));
         Some(before_v?.min(last_v?)).filter(|voltage_v| *voltage_v > 0.0)
     }
 
-    /// The latest voltage relative to the reference.
     fn share_left(&self) -> Option<f64> {
         Some(self.latest?.1 / self.reference_v()?)
     }

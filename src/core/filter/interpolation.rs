@@ -1,8 +1,7 @@
 //! Linear interpolation between breakpoints in rising order. At least two breakpoints are required.
 
-/// Returns the index of the interval that contains `x`, and the position of `x` in this interval: 0 at the lower
-/// breakpoint, 1 at the upper. If `x` lies outside the breakpoints, the interval is the nearest one and the position is
-/// below 0 or above 1.
+/// Returns the interval that contains `x`, and the position of `x` in it: 0 at the lower breakpoint, 1 at the upper.
+/// For `x` outside the breakpoints, returns the nearest interval and a position below 0 or above 1.
 pub fn locate(breakpoints: &[f64], x: f64) -> (usize, f64) {
     let last = breakpoints.len() - 2;
     let i = breakpoints[1..=last].iter().take_while(|&&b| x >= b).count();
@@ -15,14 +14,14 @@ pub fn locate_clamped(breakpoints: &[f64], x: f64) -> (usize, f64) {
     (i, along.clamp(0.0, 1.0))
 }
 
-/// Value at the position `along` (0 to 1) in the interval that begins at index `i`.
+/// Value at the position `along` (0 to 1) in the interval `i`.
 #[inline]
 pub fn between(y: &[f64], i: usize, along: f64) -> f64 {
     y[i] + along * (y[i + 1] - y[i])
 }
 
-/// Interpolates the values `y` at the breakpoints `x` linearly at `at`. Outside the breakpoints, returns the value at
-/// the nearest breakpoint.
+/// Interpolates linearly between the points (`x`, `y`). Outside the breakpoints, returns the value at the nearest
+/// breakpoint.
 pub fn interpolate(x: &[f64], y: &[f64], at: f64) -> f64 {
     let (i, along) = locate_clamped(x, at);
     between(y, i, along)

@@ -1,22 +1,20 @@
 //! Levenberg-Marquardt: finds the minimum of a cost with damped steps.
 //!
-//! The damping is reduced after a step that lowers the cost and increased after any other step. The caller computes the
-//! step for a given damping, by any method (dense or bounded, with differences or derivatives).
+//! The damping falls after a step that lowers the cost, and grows after any other step. The caller computes the step
+//! for a given damping, by any method (dense or bounded, with differences or derivatives).
 
 /// Damping, relative to the diagonal of the normal matrix.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Damping {
-    /// Initial damping.
     pub first: f64,
-    /// Factor on the damping after a step that lowers the cost.
+    /// Factor after a step that lowers the cost.
     pub fall: f64,
-    /// Factor on the damping after a step that lowers the cost, if the step before it did not lower the cost.
+    /// Factor after a step that lowers the cost, if the previous step did not.
     pub fall_after_growth: f64,
-    /// Factor on the damping after a step that does not lower the cost.
+    /// Factor after a step that does not lower the cost.
     pub growth: f64,
-    /// Minimum damping.
     pub least: f64,
-    /// Maximum damping. If an even larger damping would be needed, the search ends.
+    /// The search ends when the damping exceeds this value.
     pub most: f64,
 }
 
@@ -25,15 +23,15 @@ pub struct Damping {
 pub struct Minimum<T> {
     /// The point with the lowest cost.
     pub best: T,
-    /// Number of steps tried, including steps that did not lower the cost.
+    /// Number of steps, including steps that did not lower the cost.
     pub steps: usize,
-    /// Whether the search has converged: by the caller's criterion, or because the damping exceeds its maximum.
+    /// Whether the search has converged: by the caller's criterion, or because the damping exceeded its maximum.
     pub has_converged: bool,
 }
 
 /// Tries at most `steps` damped steps from `start`.
 ///
-/// `step(point, damping)` returns the point after one step from `point`, or `None` if that point's cost is not lower.
+/// `step(point, damping)` returns the next point, or `None` if its cost is not lower.
 /// `has_converged(from, to, damping)` is called after every step that lowers the cost.
 pub fn minimise<T>(
     damping: &Damping,
@@ -65,7 +63,7 @@ mod tests {
     const DAMPING: Damping =
         Damping { first: 1e-3, fall: 0.2, fall_after_growth: 0.2, growth: 8.0, least: 1e-9, most: 1e6 };
 
-    /// Cost of Rosenbrock's valley, with the residuals 10 (y - x^2) and 1 - x.
+    /// Rosenbrock's valley, with the residuals 10 (y - x^2) and 1 - x.
     fn cost([x, y]: [f64; 2]) -> f64 {
         50.0 * (y - x * x) * (y - x * x) + 0.5 * (1.0 - x) * (1.0 - x)
     }

@@ -2,8 +2,8 @@
 //!
 //! State x (any unit), variance P. Predict: P += Q. Update with the measurement z and its variance R: K = P / (P + R),
 //! x += K (z - x), P = (1 - K) P. Source: the capacity filter in section 3.3.4 of the paper that packwatch follows
-//! (docs/src/theory.md), in which x is the capacity in Ah and each charge/discharge transition is a step. Inputs are
-//! not checked: a NaN as input gives a NaN as result.
+//! (docs/src/theory.md). There, x is the capacity in Ah and each charge/discharge transition is a step. NaN in the
+//! input gives NaN in the result.
 
 use serde::{Deserialize, Serialize};
 
@@ -12,7 +12,6 @@ use crate::quantity::catalogue::Estimate;
 /// A scalar estimate and its variance.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct ScalarGaussian {
-    /// Estimate.
     pub mean: f64,
     /// Variance, not negative.
     pub variance: f64,
@@ -21,7 +20,6 @@ pub struct ScalarGaussian {
 /// A scalar measurement and its variance.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Measurement {
-    /// Measured value.
     pub value: f64,
     /// Variance, positive.
     pub variance: f64,
@@ -44,7 +42,7 @@ impl ScalarGaussian {
         self.variance.sqrt()
     }
 
-    /// One step of the random walk: the variance grows by `process_variance`.
+    /// One step of the random walk.
     pub fn predict(&mut self, process_variance: f64) {
         self.variance += process_variance;
     }
@@ -56,14 +54,14 @@ impl ScalarGaussian {
         self.variance *= 1.0 - gain;
     }
 
-    /// Returns the measurement (value z, variance R) that would change this estimate (x0, P0) to `after` (x1, P1):
-    /// 1/R = 1/P1 - 1/P0, z = R (x1/P1 - x0/P0).
+    /// The measurement (value z, variance R) that would change this estimate (x0, P0) to `after` (x1, P1): 1/R = 1/P1 -
+    /// 1/P0, z = R (x1/P1 - x0/P0).
     ///
-    /// The result contains only the information gained since `self`, so the assumptions in `self` do not count as
+    /// The measurement contains only the information gained since `self`, so the assumptions in `self` do not count as
     /// evidence. `None` if the variance has not fallen (P1 >= P0).
     pub fn information_until(&self, after: &Self) -> Option<Measurement> {
         let information = 1.0 / after.variance - 1.0 / self.variance;
-        // If the information gained is less than a millionth of the information in `self`, it is a rounding error.
+        // Less than a millionth of the information in `self` is a rounding error.
         if !information.is_finite() || information <= 1e-6 / self.variance {
             return None;
         }
@@ -72,9 +70,8 @@ impl ScalarGaussian {
     }
 }
 
-/// Updates N states `x` and their covariance `p` with an innovation.
-///
-/// `ph` is the covariance of the states with the measurement. The gain is `ph / innovation_variance`.
+/// Updates N states `x` and their covariance `p` with an innovation. `ph` is the covariance of the states with the
+/// measurement. The gain is `ph / innovation_variance`.
 pub fn update_states<const N: usize>(
     x: &mut [f64; N],
     p: &mut [[f64; N]; N],

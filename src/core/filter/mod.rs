@@ -1,5 +1,5 @@
 //! Mathematics of the estimators: scalar Kalman filter, interpolation, bisection, minimisation, statistics and
-//! arithmetic on several numbers at once. This module knows nothing about batteries.
+//! arithmetic on several numbers at once. Nothing here is specific to batteries.
 //!
 //! In and out: numbers in any unit.
 

@@ -1,22 +1,21 @@
 //! Arithmetic on L numbers at once, for filters that step several cells together.
 //!
 //! Every operation treats each lane separately, with a fixed order of IEEE 754 operations (no fused multiply-add, no
-//! library function). The result of a lane therefore has the same bits for every L, for any values in the other lanes
-//! and for every instruction width. The compiler vectorises the loops. NaN and infinities follow IEEE 754 unless a
-//! method states otherwise.
+//! library function). A lane's result therefore has the same bits for any L, any other lanes and any instruction width.
+//! The compiler vectorises the loops. NaN and infinities follow IEEE 754 unless a method states otherwise.
 
 use std::ops::{Add, BitAnd, Div, Mul, Neg, Not, Sub};
 
-/// L numbers.
+/// L numbers, one per lane.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Lanes<const L: usize>(pub [f64; L]);
 
-/// L booleans. In a true lane, all 64 bits are set; in a false lane, no bit is set.
+/// L booleans, one per lane: all 64 bits set for true, no bit for false.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Mask<const L: usize>([u64; L]);
 
-/// Calls `lane` for each index and returns the results. This is a plain loop, because the standard library's `from_fn`
-/// is not inlined into long callers; with `from_fn`, a replay of one cell takes 9 % longer.
+/// Replaces the standard library's `from_fn`, which is not inlined into long callers and makes a replay of one cell 9 %
+/// slower.
 #[inline(always)]
 fn from_fn<T: Copy + Default, const L: usize>(mut lane: impl FnMut(usize) -> T) -> [T; L] {
     let mut lanes = [T::default(); L];
@@ -81,7 +80,6 @@ impl<const L: usize> Not for Mask<L> {
 }
 
 impl<const L: usize> Mask<L> {
-    /// Sets each lane to the result of a predicate of the lane index.
     #[inline(always)]
     fn from_fn(mut predicate: impl FnMut(usize) -> bool) -> Self {
         Self(from_fn(|i| if predicate(i) { u64::MAX } else { 0 }))
@@ -138,7 +136,7 @@ impl<const L: usize> Lanes<L> {
         self * self
     }
 
-    /// Square root of each lane; NaN below 0.
+    /// Square root; NaN below 0.
     #[inline(always)]
     pub fn sqrt(self) -> Self {
         Self(from_fn(|i| self.0[i].sqrt()))
@@ -156,31 +154,31 @@ impl<const L: usize> Lanes<L> {
         Self(from_fn(|i| self.0[i].abs()))
     }
 
-    /// The smaller value of `self` and `other` in each lane; the value of `other` if the lane of `self` is NaN.
+    /// The smaller value in each lane; the value of `other` if the lane of `self` is NaN.
     #[inline(always)]
     pub fn smaller(self, other: Self) -> Self {
         Self(from_fn(|i| if self.0[i] < other.0[i] { self.0[i] } else { other.0[i] }))
     }
 
-    /// The smaller of each lane and `limit`; `limit` where the lane is NaN.
+    /// At most `limit`; `limit` where the lane is NaN.
     #[inline(always)]
     pub fn at_most(self, limit: f64) -> Self {
         Self(from_fn(|i| if self.0[i] < limit { self.0[i] } else { limit }))
     }
 
-    /// The larger of each lane and `limit`; `limit` where the lane is NaN.
+    /// At least `limit`; `limit` where the lane is NaN.
     #[inline(always)]
     pub fn at_least(self, limit: f64) -> Self {
         Self(from_fn(|i| if self.0[i] > limit { self.0[i] } else { limit }))
     }
 
-    /// Whether each lane of `self` is greater than the lane of `other`; false if either lane is NaN.
+    /// Whether each lane is greater than the lane of `other`; false for NaN.
     #[inline(always)]
     pub fn above(self, other: Self) -> Mask<L> {
         Mask::from_fn(|i| self.0[i] > other.0[i])
     }
 
-    /// Whether each lane is greater than `limit`; false if the lane is NaN.
+    /// Whether each lane is greater than `limit`; false for NaN.
     #[inline(always)]
     pub fn above_number(self, limit: f64) -> Mask<L> {
         Mask::from_fn(|i| self.0[i] > limit)
@@ -198,8 +196,7 @@ impl<const L: usize> Lanes<L> {
         Self(from_fn(|i| if mask.0[i] != 0 { self.0[i] } else { other.0[i] }))
     }
 
-    /// e^x with a relative error below 3 x 2^-52. If x <= -708, returns 0; if x > 709 or x is NaN, returns e^709. To
-    /// detect NaN, check the argument.
+    /// e^x with a relative error below 3 x 2^-52. Returns 0 for x <= -708, and e^709 for x > 709 or NaN.
     #[inline(always)]
     pub fn exp(self) -> Self {
         let x = self.at_most(709.0);
@@ -218,8 +215,8 @@ impl<const L: usize> Lanes<L> {
         )
     }
 
-    /// ln x for a normal, positive x. The error is at most two units in the last place of the result. If |ln x| is
-    /// below 1e-3, the error is at most two units in the last place of 1e-3.
+    /// ln x for a normal, positive x. The error is at most two units in the last place of ln x, or of 1e-3 if |ln x| is
+    /// smaller.
     #[inline(always)]
     pub fn ln(self) -> Self {
         Self(from_fn(|i| ln(self.0[i])))
@@ -231,9 +228,7 @@ impl<const L: usize> Lanes<L> {
 struct ExpSeries<const L: usize> {
     /// A floating-point number whose lowest bits contain n.
     shifted: Lanes<L>,
-    /// Sum of the terms with even powers of r.
     even: Lanes<L>,
-    /// Sum of the terms with odd powers of r.
     odd: Lanes<L>,
 }
 
@@ -243,15 +238,14 @@ impl<const L: usize> ExpSeries<L> {
         let shifted = x * std::f64::consts::LOG2_E + ROUNDER;
         let n = shifted - ROUNDER;
         let r = (x - n * LN_2_HIGH) - n * LN_2_LOW;
-        // Even and odd powers are summed separately, because two short dependency chains are faster than one long
-        // chain.
+        // Two short dependency chains are faster than one long chain, so even and odd powers are summed separately.
         let r2 = r.square();
         let even = EXP_EVEN.iter().fold(Lanes::splat(1.0 / 479_001_600.0), |sum, factor| sum * r2 + *factor);
         let odd = EXP_ODD.iter().fold(Lanes::splat(1.0 / 39_916_800.0), |sum, factor| sum * r2 + *factor);
         Self { shifted, even, odd: odd * r }
     }
 
-    /// Multiplies `sum` by 2^n or 2^-n: `change` adds n to the exponent bits of `sum` or subtracts n from them.
+    /// Multiplies `sum` by 2^n or 2^-n: `change` adds n to the exponent bits or subtracts n.
     #[inline(always)]
     fn scaled(&self, sum: Lanes<L>, change: fn(u64, u64) -> u64) -> Lanes<L> {
         // The shift drops the bits above n.
@@ -266,8 +260,7 @@ fn ln(x: f64) -> f64 {
     let above = x.to_bits().wrapping_sub(SQRT_HALF_BITS);
     let exponent = above & 0xFFF0_0000_0000_0000;
     let m = f64::from_bits(x.to_bits().wrapping_sub(exponent));
-    // Converts the exponent e to a float without an integer conversion: puts its low bits into the mantissa of a large
-    // number.
+    // Convert e to a float without an integer conversion: put its low bits into the mantissa of a large number.
     let biased = (exponent >> 52).wrapping_add(2048) & 0xFFF;
     let e = f64::from_bits(LARGE.to_bits() | biased) - (LARGE + 2048.0);
     let s = (m - 1.0) / (m + 1.0);
@@ -276,14 +269,14 @@ fn ln(x: f64) -> f64 {
     2.0 * s * series + e * std::f64::consts::LN_2
 }
 
-/// At and below this x, [`Lanes::exp`] returns 0, because smaller results would be subnormal.
+/// At and below this x, [`Lanes::exp`] returns 0, because e^x would be subnormal.
 const LEAST: f64 = -708.0;
-/// If this number is added to a number x with |x| < 2^51, the sum contains x rounded to an integer.
+/// Adding this number to x (|x| < 2^51) rounds x to an integer.
 const ROUNDER: f64 = 6_755_399_441_055_744.0; // 1.5 * 2^52
 /// 2^52.
 const LARGE: f64 = 4_503_599_627_370_496.0;
 const SQRT_HALF_BITS: u64 = std::f64::consts::FRAC_1_SQRT_2.to_bits();
-/// ln 2 in two parts. The first part has only 32 significant bits, so its product with a small integer is exact.
+/// ln 2 in two parts. The first part has only 32 significant bits, so that its product with a small integer is exact.
 const LN_2_HIGH: f64 = f64::from_bits(0x3FE6_2E42_FEE0_0000);
 const LN_2_LOW: f64 = f64::from_bits(0x3DEA_39EF_3579_3C76);
 

@@ -1,8 +1,8 @@
 //! Median, range and normal distribution, for numbers in any unit.
 
-/// Median of the finite values (of two middle values, the upper value); `None` without a finite value.
+/// Median of the finite values; of two middle values, the upper value. `None` without a finite value.
 pub fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
-    // Allocates once. Collecting a filtered iterator would start with a small buffer and grow it.
+    // Allocate once, because collecting a filtered iterator would grow a small buffer repeatedly.
     let mut finite = Vec::with_capacity(values.size_hint().1.unwrap_or_default());
     finite.extend(values.filter(|value| value.is_finite()));
     let middle = finite.len() / 2;
@@ -12,7 +12,7 @@ pub fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
     Some(*finite.select_nth_unstable_by(middle, f64::total_cmp).1)
 }
 
-/// Minimum and maximum of the values; infinity and minus infinity without values.
+/// Minimum and maximum; infinity and minus infinity without values.
 pub fn ends(values: impl Iterator<Item = f64>) -> (f64, f64) {
     values.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), value| (low.min(value), high.max(value)))
 }
@@ -27,8 +27,7 @@ pub fn probability_below(value: f64, std: f64) -> f64 {
     0.5 * libm::erfc(-value / (std * std::f64::consts::SQRT_2))
 }
 
-/// exp(-distance^2 / 2): correlation of a quantity at two points. `distance` is the distance between the points divided
-/// by the correlation length.
+/// exp(-distance^2 / 2): correlation of a quantity between two points; `distance` in correlation lengths.
 pub fn bell(distance: f64) -> f64 {
     libm::exp(-0.5 * distance * distance)
 }

@@ -34,7 +34,6 @@ pub enum CapacityMethod {
 /// Settings of the capacity filter, a random walk that steps once per half-cycle.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CapacityConfig {
-    /// How the capacity is measured.
     pub method: CapacityMethod,
     /// Process noise: standard deviation gained per equivalent full cycle (`Swing`) or per half-cycle (`Nominal`) (Ah).
     pub noise_ah_per_cycle: f64,
@@ -76,7 +75,6 @@ pub struct RechargeConfig {
     pub reference_current_a: f64,
     /// If a charge covers less than this fraction of the window, the normalised period of the charge is not reported.
     pub min_coverage: f64,
-    /// Which period the alarm rule uses.
     pub alarm_on: RechargeAlarm,
 }
 
@@ -98,16 +96,12 @@ pub struct UsableConfig {
 /// Settings for learning at charge/discharge transitions.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct HealthConfig {
-    /// Settings for detecting charge, rest and discharge.
     pub transition: TransitionConfig,
-    /// Settings of the capacity filter.
     pub capacity: CapacityConfig,
-    /// Settings of the recharge period.
     pub recharge: RechargeConfig,
     /// Capacity at which a cell is at the end of its life (Ah).
     pub end_of_life_ah: f64,
     /// Load for the usable capacity; `None` = the usable capacity is not computed.
     pub usable: Option<UsableConfig>,
-    /// Limits for energy, time and power.
     pub outlook: OutlookConfig,
 }

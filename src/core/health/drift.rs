@@ -50,7 +50,6 @@ impl DriftFilter {
         ScalarGaussian { mean: self.x[C], variance: self.p[C][C] + lasting }
     }
 
-    /// Checks the numbers of a stored filter. The error names the first impossible number.
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         InvalidState::unless_capacity("a learned capacity", self.x[C])?;
         let all = self.x.iter().chain(self.p.iter().flatten()).chain(self.by_end.iter().flatten());

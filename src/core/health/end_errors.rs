@@ -1,16 +1,14 @@
-//! Computes how errors of the cell model at the start and end of a half-cycle change the learned capacity. Two
-//! half-cycles between the same SOC values have the same errors, so averaging over many half-cycles does not remove
-//! these errors.
+//! Computes how errors of the cell model at the start and end of a half-cycle change the learned capacity. Half-cycles
+//! between the same SOC values have the same errors, so these errors do not average out.
 //!
 //! In: SOC at the start and end of a half-cycle. Out: change of the half-cycle's capacity (Ah) per standard deviation
 //! of each error.
 //!
 //! A half-cycle's capacity is charge / (s_high - s_low). An error e (V) of the open-circuit curve at one end changes
 //! the SOC at this end by e / slope, and the capacity by (C / swing) (e / slope). The errors are defined at SOC nodes.
-//! The errors are independent of each other and are interpolated linearly between the nodes. The size of the errors is
-//! `end_error_v` of the settings or, by default, follows from the voltage error that the cell model states. If the
-//! settings and the model state no error, the errors are 0 here; the constant voltage offset of the cell's estimator
-//! then also covers errors of the curve.
+//! They are independent of each other and are interpolated linearly between the nodes. Their size is `end_error_v` of
+//! the settings or, by default, follows from the voltage error that the cell model states. If neither states an error,
+//! the errors are 0 here. The constant voltage offset of the cell's estimator then also covers errors of the curve.
 
 use super::CapacityConfig;
 use super::half_cycle::HalfCycle;
@@ -23,8 +21,8 @@ use crate::quantity::Mode;
 pub(super) const END_ERRORS: usize = 5;
 
 /// Change of a half-cycle's capacity (Ah) per standard deviation of each error; zero if the SOC at the half-cycle's
-/// ends is unknown. `is_label`: whether the model is the model of a label. If so, the whole uncertainty of the curve is
-/// lasting.
+/// ends is unknown. `is_label`: whether the model comes from a label. If so, the whole uncertainty of the curve counts
+/// as an error that does not change.
 pub(super) fn effects_ah(
     model: &CellModel,
     config: &CapacityConfig,
@@ -36,14 +34,14 @@ pub(super) fn effects_ah(
     let Some(ends) = &half_cycle.ends else { return effects };
     let bands = ModelBands::new(model);
     let temperature = model.temperature_position(half_cycle.mean_temperature_c.unwrap_or(CURVE_C));
-    // Limits the effect: below a swing of 2 %, the measurement is useless.
+    // Below a swing of 2 %, the measurement is useless, so the effect is limited.
     let swing = (half_cycle.charge_ah / capacity_ah).max(0.02);
     // A discharge starts at its higher SOC, a charge at its lower SOC.
     let sign = if half_cycle.mode == Mode::Charge { -1.0 } else { 1.0 };
     for (soc, fuller) in ends.iter().zip([sign, -sign]) {
         let position = model.grid_position_at(&temperature, *soc);
-        // Half of the error stated by a fitted model is an error of the curve and does not change. The other half depends
-        // on the history of the current, so it differs between half-cycles.
+        // Half of the error stated by a fitted model is an error of the curve and does not change. The other half
+        // depends on the history of the current, so it differs between half-cycles.
         let of_fit_v = || model.voltage_error_v(&position).map_or(0.0, |error_v| 0.5 * error_v);
         let of_label_v = || bands.curve_std_v(*soc).unwrap_or(0.0);
         let own_v = || if is_label { of_label_v() } else { of_fit_v() };

@@ -9,24 +9,25 @@
 //! the history. State x = [level, rate, recovery, top], with capacities as fractions of a reference capacity:
 //! * level: the capacity without recovery; level -= rate dt. The use t counts equivalent full cycles, or days if the
 //!   cycles are unknown;
-//! * rate: loss per unit of use. Its logarithm follows a random walk with two parts. The variance of the first part is
-//!   w1^2 times the capacity lost, with w1 = `RATE_WALK`. The variance of the second part grows by w2^2 while the use
-//!   since the first reading grows by a factor of e, with w2 = `RATE_WALK_USE`. Both parts are relative, so the same
-//!   constants suit cells that live for 50 cycles and for 5,000. In the linear filter,
-//!   Q = (w1^2 rate dt + w2^2 ln(t1 / t0)) (rate^2 + P_rate + (`TRANSIENT` / t0)^2), with the use t0 before the step
-//!   and t1 after the step. The last term lets a rate leave 0, after the rise of capacity that many new cells show;
-//! * recovery: capacity that returns during rest and is used up again (an Ornstein-Uhlenbeck process; measured cells
-//!   show 1 to 5 % after days of rest). Because successive readings share the recovery, ten readings within one cycle
+//! * rate: loss per unit of use. ln(rate) follows a random walk with two parts. The variance of the first part is w1^2
+//!   times the capacity lost, with w1 = `RATE_WALK`. The variance of the second part grows by w2^2 while the use since
+//!   the first reading grows by a factor of e, with w2 = `RATE_WALK_USE`. Both parts are relative, so the same
+//!   constants suit cells that live for 50 cycles and for 5,000. In the linear filter, with the use t0 before the step
+//!   and t1 after the step,
+//!   Q = (w1^2 rate dt + w2^2 ln(t1 / t0)) (rate^2 + P_rate + (`TRANSIENT` / t0)^2).
+//!   The last term lets a rate leave 0 after the rise of capacity that many new cells show;
+//! * recovery: capacity that returns during rest and is lost again in use (an Ornstein-Uhlenbeck process; measured
+//!   cells show 1 to 5 % after days of rest). Successive readings share the recovery, so ten readings within one cycle
 //!   do not count as ten independent readings;
-//! * top: the level where it was highest. Later readings improve this estimate too. Loss is counted from here: in some
-//!   families of cells the capacity first rises by 3 to 8 %.
+//! * top: the highest level, from which the loss is counted. In some families of cells, the capacity first rises by 3
+//!   to 8 %. Later readings improve this estimate.
 //!
-//! A reading is level + recovery + noise; outliers get less weight. The noise and the recovery during use have one
-//! scale, which is learned from the innovations. The readings of different cells scatter by 0.01 to 3 %.
+//! A reading is level + recovery + noise; outliers get less weight. The noise and the recovery during use share one
+//! scale, which is learned from the innovations, because the readings of different cells scatter by 0.01 to 3 %.
 //!
-//! The forecast is a mixture of fade shapes, from a square root to a knee, weighted by the rate, by the curvature since
-//! the highest level and by a prior of typical lives (see [`distribution`]). It is never refused because little has
-//! been lost; its interval is then wide. `tests/rul.md` lists figures and alternatives.
+//! The forecast is a mixture of fade shapes, from a square root to a knee. The weights follow from the rate, the
+//! curvature since the highest level, and a prior of typical lives (see [`distribution`]). If little has been lost, a
+//! forecast is still given, with a wide interval. `tests/rul.md` lists figures and alternatives.
 
 mod distribution;
 #[cfg(test)]
@@ -38,33 +39,35 @@ use self::distribution::{FadePosterior, FadeState, PriorRate};
 use crate::filter::{bisect, square, update_states};
 use crate::quantity::{DAY_S, InvalidState};
 
-/// Standard deviation that the rate's logarithm would gain while the whole reference capacity is lost. It is
-/// proportional to the square root of the loss: over a loss of 10 %, one standard deviation is a factor of e^0.32.
+/// Standard deviation that ln(rate) gains while the whole reference capacity is lost. It grows with the square root of
+/// the loss: over a loss of 10 %, one standard deviation is a factor of e^0.32.
 const RATE_WALK: f64 = 1.0;
-/// Standard deviation that the rate's logarithm gains while the use since the first reading grows by a factor of e. It
-/// is proportional to the square root of ln(use after / use before).
+/// Standard deviation that ln(rate) gains while the use since the first reading grows by a factor of e. It grows with
+/// the square root of ln(use after / use before).
 const RATE_WALK_USE: f64 = 0.45;
 /// Capacity that a new cell gains or loses while it settles, fraction of the reference.
 const TRANSIENT: f64 = 0.03;
-/// Standard deviation of the loss since the highest level that such a transient hides, fraction of the reference.
+/// Standard deviation of the loss since the highest level that the settling of a new cell hides, fraction of the
+/// reference.
 const HIDDEN_LOSS: f64 = 0.002;
-/// Standard deviation of the loss that a rise since the first reading hides, per rise.
+/// Standard deviation of the loss that a rise since the first reading hides, relative to the rise.
 const HIDDEN_BY_RISE: f64 = 0.5;
-/// Standard deviation of the level below which a rise can be counted from it, fraction of the reference.
+/// Largest standard deviation of a level from which a rise is counted, fraction of the reference.
 const KNOWN_LEVEL: f64 = 0.02;
-/// Standard deviation of the error of a reading in addition to its variance, fraction of the reference; to be
-/// multiplied by the root of the learned noise scale.
+/// Standard deviation of the error of a reading that the reading's variance does not include, fraction of the
+/// reference. It is multiplied by the square root of the learned noise scale.
 const NOISE: f64 = 0.003;
-/// Standard deviation of the recovery while the cell is used, fraction of the reference; also scaled.
+/// Standard deviation of the recovery while the cell is used, fraction of the reference. It is also multiplied by the
+/// square root of the noise scale.
 const RECOVERY_IN_USE: f64 = 0.005;
 /// Standard deviation of the recovery gained by rest, fraction of the reference.
 const RECOVERY_IN_REST: f64 = 0.02;
 /// Time constant of the recovery during rest (days). If use is counted in days, the recovery also decays with this time
 /// constant.
 const RECOVERY_DAYS: f64 = 1.0;
-/// Number of readings that the initial noise scale counts for, and maximum number that the scale averages over.
+/// Weight of the initial noise scale (number of readings), and maximum number of readings that the scale averages over.
 const SCALE_READINGS: (f64, f64) = (5.0, 20.0);
-/// Range of the noise scale (variance). The readings scatter by 0.01 to 2 %.
+/// Range of the noise scale (variance).
 const SCALE_RANGE: (f64, f64) = (1e-3, 20.0);
 
 /// Minimum number of readings for a forecast: two readings give a rate, and the third can contradict it.
@@ -72,7 +75,6 @@ pub const MIN_READINGS: u32 = 3;
 /// Time constant of the exponentially weighted sums that give the recent rate of use (days).
 const RECENT_DAYS: f64 = 30.0;
 
-/// Quantiles of the forecast: 5, 50 and 95 %.
 const QUANTILES: [f64; 3] = [0.05, 0.5, 0.95];
 
 const LEVEL: usize = 0;
@@ -163,7 +165,7 @@ pub struct FanPoint {
     pub high_ah: f64,
 }
 
-/// The forecast filter of one cell. The size of the filter does not depend on the number of readings.
+/// The forecast filter of one cell.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Forecast {
@@ -178,7 +180,7 @@ pub struct Forecast {
     /// Learned variance of noise and recovery during use, relative to the constants.
     #[serde(default = "usual_noise")]
     noise_scale: f64,
-    /// Level when it was first known to [`KNOWN_LEVEL`]; `None` before.
+    /// Level when its standard deviation first fell below [`KNOWN_LEVEL`]; `None` before.
     #[serde(default)]
     first_level: Option<f64>,
     /// Use since the first reading at which the level was highest.
@@ -188,7 +190,6 @@ pub struct Forecast {
     recent: [f64; 2],
 }
 
-/// The noise scale before anything is known.
 fn usual_noise() -> f64 {
     1.0
 }
@@ -211,8 +212,8 @@ impl Usage {
 }
 
 impl Forecast {
-    /// Creates a filter for a cell that had the capacity `reference_ah` (Ah) when new. An approximate value suffices:
-    /// the loss is counted from `reference_ah`, or from the highest level if that is higher.
+    /// Creates a filter for a cell that had the capacity `reference_ah` (Ah) when new. An approximate value suffices,
+    /// because the loss is counted from `reference_ah` or from the highest level, whichever is higher.
     pub fn new(axis: Axis, reference_ah: f64) -> Self {
         let mut p = [[0.0; N]; N];
         // Wide priors: the level is practically unknown, and the rate has a standard deviation of 2 % per unit of use.
@@ -307,7 +308,7 @@ impl Forecast {
         Ok(())
     }
 
-    /// Capacity of the new cell (Ah), as passed to [`Self::new`].
+    /// Reference capacity (Ah), as passed to [`Self::new`].
     pub fn reference_ah(&self) -> f64 {
         self.reference_ah
     }
@@ -354,8 +355,7 @@ impl Forecast {
         Remaining { low, median, high }
     }
 
-    /// Predicted capacity at `points` evenly spaced amounts of further use from 0 to `ahead`. Too slow to call while
-    /// data are processed live.
+    /// Predicted capacity at `points` evenly spaced amounts of further use from 0 to `ahead`. Too slow for live data.
     ///
     /// # Errors
     /// The reason why no forecast is given.
@@ -399,7 +399,7 @@ impl Forecast {
         let in_rest = RECOVERY_IN_REST * RECOVERY_IN_REST;
         let recovery = &mut p[RECOVERY][RECOVERY];
         *recovery += in_use * (1.0 - kept * kept);
-        // A rest adds only the part of the recovery that is still missing after the rests before it.
+        // A rest adds only the part of the recovery that earlier rests have not added.
         *recovery += (1.0 - libm::exp(-2.0 * rest_days / RECOVERY_DAYS)) * (in_use + in_rest - *recovery).max(0.0);
         self.used += used;
     }
@@ -467,16 +467,15 @@ impl Forecast {
         self.p[LEVEL][LEVEL] + self.shared_variance
     }
 
-    /// Posterior of the shape and the rate of the fade.
     fn posterior(&self) -> FadePosterior {
         let since_top = self.used - self.used_at_top;
         let rise = self.x[TOP] - self.first_level.unwrap_or(self.x[TOP]);
-        // Transients of the first use hide a part of the loss, so they make the rate uncertain.
+        // The settling of a new cell hides a part of the loss, which makes the rate uncertain.
         let hidden =
             square(HIDDEN_LOSS / since_top.max(1e-3 * self.used)) + square(HIDDEN_BY_RISE * rise.max(0.0) / self.used);
         FadePosterior::new(FadeState {
             level: (self.x[LEVEL], self.level_variance().sqrt()),
-            // A capacity that rises does not say how fast it falls later.
+            // A rising capacity does not show how fast the capacity falls later.
             rate: (self.x[RATE].max(0.0), (self.p[RATE][RATE] + hidden).sqrt()),
             new_level: self.x[TOP].max(1.0),
             top_level: self.x[TOP],
@@ -498,7 +497,6 @@ impl Forecast {
 }
 
 impl Remaining {
-    /// Multiplies all three quantiles by `factor`.
     fn times(self, factor: f64) -> Self {
         Self { low: factor * self.low, median: factor * self.median, high: factor * self.high }
     }

@@ -6,7 +6,6 @@ use crate::quantity::Mode;
 /// One completed half-cycle of one cell.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct HalfCycle {
-    /// Charge or discharge.
     pub mode: Mode,
     /// Charge moved (Ah), positive.
     pub charge_ah: f64,
@@ -19,7 +18,6 @@ pub struct HalfCycle {
     /// SOC at the start and the end, fractions; `None` if the SOC at the end was not estimated. If only the SOC at the
     /// start is unknown, both values are the SOC at the end.
     pub ends: Option<[f64; 2]>,
-    /// Duration (s).
     pub duration_s: f64,
     /// Mean current (A); positive = discharge.
     pub mean_current_a: f64,

@@ -4,16 +4,16 @@
 //! half-cycles and capacity updates (Ah). While a cell's SOC is not estimated, the caller does not call
 //! [`Learner::learn`] for this cell.
 //!
-//! A half-cycle lasts from the beginning of a charge or discharge to its end; the transition detector determines both
-//! times. A *mark* is a copy of all totals at such a time. Two filters estimate the capacity of a cell. The *sample
-//! filter* ([`CellEstimator`]) takes a step at every sample. The *event filter* takes one step per half-cycle and holds
-//! the published capacity (a random walk; paper, section 3.3.4). The event filter's measurement is computed by one of
-//! two methods:
-//! * `Swing`: the information about the capacity in all voltages since the last half-cycle. The sample filter estimates
-//!   the capacity together with its correlation with the SOC. The measurement is computed from the sample filter's
-//!   previous estimate and its present estimate (`ScalarGaussian::information_until`). Dividing the charge by the swing
-//!   of the sample filter's SOC would be circular: that SOC was computed with the assumed capacity. With this method,
-//!   the event filter also estimates the fade ([`super::drift`]).
+//! A half-cycle lasts from the beginning of a charge or discharge to its end, as found by the transition detector. A
+//! *mark* is a copy of all totals at such a time.
+//!
+//! Two filters estimate the capacity of a cell. The *sample filter* ([`CellEstimator`]) takes a step at every sample.
+//! The *event filter* takes one step per half-cycle and holds the published capacity. It is the random walk in section
+//! 3.3.4 of the paper that packwatch follows. The measurement of the event filter is computed by one of two methods:
+//! * `Swing`: the information about the capacity in all voltages since the last half-cycle. It is computed from the
+//!   sample filter's previous and present estimates of the capacity (`ScalarGaussian::information_until`). The charge
+//!   is not divided by the swing of the sample filter's SOC, because this SOC already depends on the assumed capacity.
+//!   With this method, the event filter also estimates the fade ([`super::drift`]).
 //! * `Nominal`: as in the paper, charge divided by a nominal swing, with a fixed variance.
 
 use serde::{Deserialize, Serialize};
@@ -33,8 +33,7 @@ use crate::quantity::{InvalidState, Mode, Timestamp};
 /// difference, one of them is wrong.
 const CONTRADICTION: f64 = 4.0;
 
-/// If the variance of a capacity is below this part of the initial variance, it counts as learned with the model of a
-/// label.
+/// With the model of a label, a capacity counts as learned if its variance is below this part of the initial variance.
 const KNOWN_PART: f64 = 0.9;
 
 /// Standard deviation of the capacity of cells of one type, fraction. A smaller difference is never a contradiction.
@@ -49,7 +48,7 @@ pub struct CapacityUpdate {
     pub capacity: ScalarGaussian,
 }
 
-/// Totals of one cell since the learner was created, and the cell's SOC, at one time.
+/// SOC of one cell at one time, and totals of this cell since the learner was created.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(super) struct CellMark {
     soc: Option<ScalarGaussian>,
@@ -105,37 +104,34 @@ pub struct Learner {
     capacity: Vec<ScalarGaussian>,
     /// Time without charge or discharge since the last half-cycle (s).
     rest_s: f64,
-    /// Start of the present mode.
     mode_since: Option<Timestamp>,
     /// Whether the charge moved since `start` was too small for a half-cycle when the last charge or discharge ended.
     /// If so, `start` stays, and the next charge or discharge extends this half-cycle.
     joining: bool,
-    /// Per cell: whether the capacity has been learned.
     learned: Vec<bool>,
     /// Per cell: filter of capacity and fade (`Swing`).
     drift: Vec<DriftFilter>,
     /// Cells whose sample filter was restarted in the present half-cycle.
     in_doubt: Vec<usize>,
-    /// Offset of the current sensor.
     offset: CurrentOffset,
     /// Largest change of the charge, across several half-cycles.
     #[serde(default)]
     span: Span,
-    /// Per cell: what half-cycles teach ([`Self::prepare`]).
+    /// Per cell: how the next half-cycle is used ([`Self::prepare`]).
     #[serde(skip)]
     lessons: Vec<Lesson>,
 }
 
-/// What a half-cycle teaches about a cell's capacity.
+/// How a half-cycle is used for a cell's capacity.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Lesson {
-    /// Nothing, because its readings are doubtful.
+    /// Not at all, because its readings are doubtful.
     Nothing,
-    /// The capacity, with a cell model of a label. Only a large [`Span`] teaches, and the capacity counts as learned when
-    /// its variance is clearly smaller than `before`, the variance before anything was measured (Ah^2).
-    /// `soc_error`: error of a SOC by voltage that comes from the loads before (fraction).
+    /// With a cell model of a label. Only a large [`Span`] is used. The capacity counts as learned when its variance is
+    /// clearly smaller than `before`, the variance before anything was measured (Ah^2). `soc_error`: error of a SOC by
+    /// voltage that the preceding loads cause (fraction).
     ByLabel { before: f64, soc_error: f64 },
-    /// The capacity, with a cell model that was fitted to cells of this type.
+    /// With a cell model that was fitted to cells of this type.
     ByModel,
 }
 
@@ -202,9 +198,9 @@ impl Learner {
     /// Adds a sample of `cell` to the totals of this cell.
     ///
     /// `measured_s` and `gap_s` are the times since the previous sample with and without a measured current (s). The
-    /// gap is infinite before the first sample and after a gap of unknown length. Returns whether the candidate began
-    /// within that gap. If so, the caller sets the SOC at the candidate's mark to the SOC after the gap
-    /// ([`Self::move_mark`]).
+    /// gap is infinite before the first sample and after a gap of unknown length. Returns whether the candidate (an
+    /// unconfirmed mode) began within that gap. If so, the caller sets the SOC at the candidate's mark to the SOC after
+    /// the gap ([`Self::move_mark`]).
     #[inline]
     pub fn observe(
         &mut self,
@@ -288,12 +284,12 @@ impl Learner {
         }
     }
 
-    /// Sets what the next half-cycle teaches each cell. Has no effect with `Nominal`.
+    /// Sets how the next half-cycle is used for each cell. Has no effect with `Nominal`.
     pub fn prepare(&mut self, lesson: impl Fn(usize) -> Lesson) {
         self.lessons = (0..self.capacity.len()).map(lesson).collect();
     }
 
-    /// Restarts the span, because the current was doubtful: the counted charge may be wrong.
+    /// Restarts the span, because the current was doubtful and the counted charge may be wrong.
     pub fn interrupt_span(&mut self) {
         self.span = Span::default();
     }
@@ -334,7 +330,7 @@ impl Learner {
             _ => true,
         };
         self.learned[cell] |= measurement.is_some() && is_known;
-        // A measurement that leaves the capacity mostly assumed is no measurement for the readers.
+        // While the capacity is still mostly assumed, the measurement is not reported.
         let measurement = measurement.filter(|_| self.learned[cell]);
         CapacityUpdate { measurement, capacity: self.capacity(cell) }
     }
@@ -439,8 +435,8 @@ impl Learner {
                 && difference * difference > CONTRADICTION * CONTRADICTION * (z.variance + expected.variance)
         };
         if let Some(z) = measurement.filter(is_contradiction) {
-            // The measured or the expected capacity is wrong; further half-cycles decide. Each contradiction adds at
-            // most the variance of new cells, so that one wild measurement does not make the capacity unknown.
+            // The measured or the expected capacity is wrong, and further half-cycles decide. Each contradiction adds
+            // at most the variance of new cells, so that one outlier does not make the capacity unknown.
             let difference = z.value - expected.mean;
             let doubt = difference * difference / (CONTRADICTION * CONTRADICTION);
             let spread_ah = NEW_SPREAD * model.capacity_ah;

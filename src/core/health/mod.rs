@@ -1,9 +1,8 @@
 //! Battery ageing: half-cycles, capacity, recharge period, usable capacity, remaining life.
 //!
 //! In: currents (A), samples and estimates of the cells. Out: one [`HalfCycle`] and one [`CapacityUpdate`] per cell and
-//! half-cycle, values of the pack, recharge periods (s), usable capacity (Ah), [`Forecast`]s and the
-//! [`UseRecord`]. Stored states are
-//! checked before they are used. A half-cycle without an estimated SOC gives no capacity.
+//! half-cycle, values of the pack, recharge periods (s), usable capacity (Ah), [`Forecast`]s and the [`UseRecord`].
+//! Stored states are checked before they are used. A half-cycle without an estimated SOC gives no capacity.
 
 pub mod config;
 pub mod drift;

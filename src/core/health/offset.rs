@@ -3,7 +3,7 @@
 //! In: the evidence in the voltages of all cells ([`EstimatorBank::offset_evidence`]) and the elapsed time (s). Out:
 //! mean and standard deviation of the offset (A) per cell, measured minus true. The offset is best observed at rest,
 //! when the counted charge drifts but the voltage does not. Current readings of exactly zero are ignored, because a
-//! sensor that sends them suppresses small currents.
+//! sensor that reads exactly zero suppresses small currents.
 //!
 //! Source: Friedland (1969), separate estimation of a bias: the innovations of a filter that ignores the bias are used
 //! to estimate the bias. Deviation: here the filter considers the bias in its gain, and the correction is applied only
@@ -74,7 +74,6 @@ impl CurrentOffset {
         }
     }
 
-    /// Checks the numbers of a stored offset. The error names the first impossible number.
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         InvalidState::unless_number("the offset of the current", self.mean_a)?;
         let part = self.part();

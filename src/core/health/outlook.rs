@@ -3,13 +3,14 @@
 //! In: state and model of every cell ([`CellNow`]), the recent load ([`RecentLoad`]) and the limits
 //! ([`OutlookConfig`]). Out: [`Outlook`] of the pack, with variances. Currents are per cell, positive = discharge.
 //!
-//! * All cells of a series pack carry the same charge. A discharge ends when the first cell is empty, a charge when the
-//!   first cell is full. Energy is the integral of the cells' voltages over that charge, less the losses at the recent
-//!   load.
-//! * A charge continues at the recent current until the first cell reaches its highest voltage. From there on, the
-//!   current is the one that keeps the cell at this voltage, until it has fallen to the taper current.
-//! * Power is the largest constant current that keeps every cell within its voltages for a time, times the voltage at
-//!   the end of that time. It follows from the step response of the equivalent circuit.
+//! * A discharge ends when the first cell is empty, and a charge ends when the first cell is full. All cells of a
+//!   series pack carry the same charge. Energy is the integral of the cells' voltages over this charge, less the losses
+//!   at the recent load.
+//! * A charge continues at the recent current until the first cell reaches its highest voltage. Then the charger holds
+//!   this voltage, and the current falls until it reaches the taper current.
+//! * Power is stated for each duration in [`POWER_S`]. It is the product of current and voltage at the end of the
+//!   duration. The current is the largest constant current that keeps every cell within its voltage limits. Current and
+//!   voltage follow from the step response of the equivalent circuit.
 //!
 //! Variances are propagated to first order from SOC, capacity and resistance of the limiting cell.
 
@@ -22,7 +23,7 @@ use crate::quantity::{CellIndex, InvalidState, Mode, Timestamp};
 
 /// Times for which the power is stated (s).
 pub const POWER_S: [f64; 3] = [2.0, 10.0, 30.0];
-/// Time over which the load of a discharge is averaged (s). Over half an hour, fast and slow parts of a drive mix.
+/// Time over which the load of a discharge is averaged (s). Half an hour includes fast and slow parts of a drive.
 const LOAD_S: f64 = 1800.0;
 /// Standard deviation of ln(charging time that the taper adds). It is large, because the current of a model without a
 /// slow branch falls too fast.
@@ -33,18 +34,18 @@ const LEAST_MEAN: f64 = 0.1;
 /// Standard deviation of ln(future load over recent load): a driver needs a third more or less in the next half hour.
 const LOG_LOAD_STD: f64 = 0.3;
 /// Time over which the current of a charge is averaged (s). A charger regulates its current. Braking ends sooner, so a
-/// charge counts only after this time. A longer gap between two currents is not averaged.
+/// charge counts only after this time. If the gap between two currents is longer, it is not averaged.
 const CHARGER_S: f64 = 60.0;
-/// Halvings of a search for a SOC: 0.02 %.
+/// Number of halvings in a search for a SOC, for a resolution of 0.02 %.
 const HALVINGS: u32 = 12;
-/// Newton's steps of the search for the current at a voltage limit.
+/// Number of Newton steps in the search for the current at a voltage limit.
 const CURRENT_STEPS: u32 = 5;
 /// Number of intervals of an integral over the charge.
 const INTERVALS: u32 = 8;
 /// Number of steps of a charge.
 const CHARGE_STEPS: u32 = 64;
 
-/// Limits of a cell and the end of a charge.
+/// Limits of a cell, and settings for the end of a charge.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct OutlookConfig {
     /// Lowest voltage (V); `None` = the cell model's lowest voltage.
@@ -124,7 +125,7 @@ impl RecentLoad {
         }
     }
 
-    /// After a sleep or a restart: forgets the time of the latest current, so that the pause is not averaged.
+    /// After a sleep or a restart, forgets the time of the latest current, so that the pause is not averaged.
     pub fn interrupt(&mut self) {
         self.latest = None;
     }
@@ -166,7 +167,7 @@ impl Load {
         Self { mean_a, mean_square_a2: square(mean_a), peak_a: mean_a }
     }
 
-    /// The load that is assumed while none is known: C/2 with a largest current of 1C.
+    /// The load that is assumed while no load is known: C/2 with a largest current of 1C.
     fn usual(rated_ah: f64) -> Self {
         Self { peak_a: rated_ah, ..Self::constant(USUAL_LOAD_PER_H * rated_ah) }
     }
@@ -190,7 +191,7 @@ impl Load {
     }
 }
 
-/// What is known about one cell.
+/// State and model of one cell.
 #[derive(Debug, Clone, Copy)]
 pub struct CellNow<'a> {
     pub model: &'a CellModel,
@@ -200,7 +201,7 @@ pub struct CellNow<'a> {
     pub capacity: ScalarGaussian,
     /// Resistance relative to the model.
     pub resistance_ratio: f64,
-    /// Standard deviation of its logarithm, with the model's own error at this SOC and temperature.
+    /// Standard deviation of ln(resistance ratio), including the model's own error at this SOC and temperature.
     pub log_resistance_std: f64,
     /// Additional resistance ratio of the slowest branch.
     pub slow_ratio: f64,
@@ -210,7 +211,6 @@ pub struct CellNow<'a> {
     pub temperature: TemperaturePosition,
 }
 
-/// Direction of a current.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Direction {
     Discharge,
@@ -244,7 +244,7 @@ impl CellNow<'_> {
         self.resistance(at, |_| 1.0)
     }
 
-    /// Resistance (ohm) with the share of each branch that `share` gives for its time constant.
+    /// Resistance (ohm). `share` maps the time constant of a branch (s) to the fraction of its resistance that counts.
     fn resistance(&self, at: &GridPosition, share: impl Fn(f64) -> f64) -> f64 {
         let model = self.model;
         let slowest = model.branches.len() - 1;
@@ -277,7 +277,8 @@ impl CellNow<'_> {
         self.capacity.mean * (self.soc.mean - self.empty_soc(load, config)).max(0.0)
     }
 
-    /// Charge (Ah) that the cell takes up until it is full: until the taper current keeps it at its highest voltage.
+    /// Charge (Ah) that the cell takes up until it is full. It is full when the taper current keeps it at its highest
+    /// voltage.
     fn chargeable_ah(&self, config: &OutlookConfig) -> f64 {
         let soc = self.soc.mean;
         let (full, _) = bisect((soc.min(1.0), 1.0), HALVINGS, |soc| self.held_a(soc, config) > config.taper_current_a);
@@ -317,8 +318,8 @@ impl CellNow<'_> {
         })
     }
 
-    /// Open-circuit voltage less the relaxing branches (V), and resistance (ohm), `after_s` after the current has
-    /// changed to `current_a`, positive = discharge.
+    /// Open-circuit voltage minus the voltages of the relaxing branches (V), and resistance (ohm). Both values apply
+    /// `after_s` after the current has changed to `current_a` (positive = discharge).
     fn response(&self, current_a: f64, after_s: f64) -> (f64, f64) {
         let (model, now) = (self.model, &self.position(self.soc.mean));
         let moved = current_a * after_s / (3600.0 * self.capacity.mean);
@@ -353,9 +354,9 @@ impl CellNow<'_> {
         (open_v - signed_a * ohm).max(0.0)
     }
 
-    /// A value of the cell with its variance. `value` is computed again with each of SOC, capacity and ln resistance
-    /// one standard deviation higher and lower; the larger change counts, because a SOC of 0 or 1 changes to one side
-    /// only.
+    /// A value of the cell with its variance. `value` is computed again with SOC, capacity and ln(resistance) each one
+    /// standard deviation higher and lower. The larger change counts, because a SOC of 0 or 1 can change in only one
+    /// direction.
     fn spread(&self, value: impl Fn(&Self) -> f64) -> ScalarGaussian {
         let mean = value(self);
         let part = |change: fn(&mut Self, f64)| {
@@ -395,11 +396,11 @@ pub struct Outlook {
     pub to_full_s: Option<ScalarGaussian>,
     /// Time until the pack reaches the configured SOC (s); `None` unless the pack is charged.
     pub to_target_s: Option<ScalarGaussian>,
-    /// Power of a discharge for each of [`POWER_S`] (W).
+    /// Discharge power for each time in [`POWER_S`] (W).
     pub discharge_w: [ScalarGaussian; 3],
-    /// Power of a charge for each of [`POWER_S`] (W).
+    /// Charge power for each time in [`POWER_S`] (W).
     pub charge_w: [ScalarGaussian; 3],
-    /// The cells that limit the power of a discharge and of a charge for 10 s.
+    /// The cell that limits the 10 s discharge power, and the cell that limits the 10 s charge power.
     pub limiting_cells: [CellIndex; 2],
 }
 
@@ -408,7 +409,6 @@ pub struct Outlook {
 pub struct Structure {
     /// Cells in series per [`CellNow`]: 1, or the number of cells if only the pack's total voltage is measured.
     pub series_per_state: f64,
-    /// Parallel strings.
     pub strings: f64,
     /// State of charge of the pack, fraction.
     pub soc: f64,
@@ -439,7 +439,7 @@ pub fn of_pack(
     let sum = |value: &dyn Fn(&CellNow<'_>) -> f64| {
         pack.strings * pack.series_per_state * cells.iter().map(value).sum::<f64>()
     };
-    // The errors of all cells count as equal, because they share the current sensor and the model.
+    // The errors of all cells count as equal, because the cells share the current sensor and the model.
     let whole = |one: ScalarGaussian, value: &dyn Fn(&CellNow<'_>) -> f64| ScalarGaussian {
         mean: sum(value),
         variance: square(sum(&|_| 1.0)) * one.variance,

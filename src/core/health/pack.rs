@@ -18,7 +18,6 @@ use crate::quantity::{CellIndex, InvalidState};
 /// One cell's contribution to the pack.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CellShare {
-    /// Index of the cell.
     pub cell: CellIndex,
     /// State of charge, fraction.
     pub soc: ScalarGaussian,
@@ -99,7 +98,7 @@ mod tests {
 
     #[test]
     fn weakest_cell_limits_discharge_and_fullest_limits_charge() {
-        // Cell 1 has 1.0 Ah left, and cell 0 accepts only 0.5 Ah: an unbalanced pack of 1.5 Ah with a SOC of 2/3.
+        // Cell 1 has 1.0 Ah left, and cell 0 accepts only 0.5 Ah. The pack therefore has 1.5 Ah and a SOC of 2/3.
         let pack = combine([share(0, 0.8, 2.5), share(1, 0.4, 2.5)].into_iter()).expect("two cells");
         assert!((pack.capacity_ah - 1.5).abs() < 1e-12);
         assert!((pack.soc - 1.0 / 1.5).abs() < 1e-12);

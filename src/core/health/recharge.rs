@@ -1,5 +1,5 @@
-//! Recharge period: duration of a charge between two SOC values, the *window* (paper, section 3.3.5), raw and
-//! normalised.
+//! Recharge period: duration of a charge between two SOC values, the *window*, raw and normalised (section 3.3.5 of the
+//! paper that packwatch follows).
 //!
 //! In: the estimated SOC with its time, the mode, the learned capacity (Ah). Out: periods (s). If the estimated SOC
 //! jumps, the caller discards the charge that is being timed.
@@ -13,18 +13,16 @@
 //! The standard deviation of t is the standard deviation of C times the same factor. It therefore includes the gain
 //! error of the current sensor.
 //!
-//! Why t uses C instead of the charge moved within the window: the estimated SOC moves by the charge divided by the
+//! Reason for C instead of the charge moved within the window: the estimated SOC moves by the charge divided by the
 //! assumed capacity. The charge moved within the window is therefore the width of the window times the assumed
-//! capacity, corrected only by the voltages within the window. C uses these voltages and all earlier ones, weighted by
-//! their information. Over the fleet of `tests/recharge_fleet.rs`, which prints both results, the RMS error is 0.57 %
-//! with C and 0.78 % with the charge moved. Further advantages of C: it has a standard deviation, and it does not
-//! require a charge that covers the whole window.
+//! capacity, corrected only by the voltages within the window. C uses these voltages and all earlier voltages, weighted
+//! by their information. Over the fleet of `tests/recharge_fleet.rs`, the RMS error is 0.57 % with C and 0.78 % with
+//! the charge moved. C also has a standard deviation, and does not require a charge that covers the whole window.
 //!
 //! Assumed: the reference charger holds its current over the whole window, so resistance, temperature and tapering have
 //! no effect. C is the capacity between the open-circuit voltages of the full and the empty cell at the model's
-//! reference temperature, whatever the temperature during the charge. A separate reference temperature cannot be
-//! configured. The charge that a cold or worn cell accepts within a charger's voltage limit is a different quantity;
-//! the module `usable` computes the corresponding quantity for discharges.
+//! reference temperature, whatever the temperature during the charge. The charge that a cold or worn cell accepts
+//! within a charger's voltage limit is a different quantity.
 //!
 //! Deviation 1: the paper's script counts from the first charging sample, at any SOC. Here, a raw period requires one
 //! uninterrupted charge over the whole window. Reason: the periods are then comparable.

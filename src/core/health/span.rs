@@ -3,9 +3,9 @@
 //! In: marks, which are copies of all totals at the ends of modes. Out: pairs of marks between which a large charge has
 //! moved in one direction.
 //!
-//! A car discharges in several trips, and clouds interrupt the charge of a boat. A single half-cycle then shows little
-//! about the capacity. A *span* lasts from one turn of the counted charge to the next. A small change in the other
-//! direction does not end a span.
+//! A single half-cycle is often too small to measure the capacity. For example, a car discharges in several trips, and
+//! clouds interrupt the charge of a boat. A *span* lasts from one turning point of the counted charge to the next. A
+//! small change in the other direction does not end a span.
 //!
 //! While no current was measured, the cells may have been charged or used. If the SOC by voltage has changed by more
 //! than [`JUMP`], the span starts again. Otherwise, the charge that may have flowed is part of the span's error.
@@ -26,8 +26,8 @@ const LEAST: f64 = 0.25;
 /// Smallest charge in the other direction that ends a span, as a part of the rated capacity.
 const TURN: f64 = 0.05;
 
-/// Change of the SOC by voltage while no current was measured that shows use or a charge (fraction). A voltage after a
-/// load differs by less from the voltage after a rest.
+/// Change of the SOC by voltage (fraction) that shows a charge or a discharge while no current was measured. The
+/// difference between a voltage after a load and a voltage after a rest causes a smaller change.
 const JUMP: f64 = 0.08;
 
 /// Standard deviation of the charge that may have flowed unnoticed while no current was measured, as a part of the
@@ -38,13 +38,11 @@ const UNNOTICED: f64 = 0.03;
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Span {
-    /// Start.
     start: Option<Mark>,
     /// The mark with the largest change of the charge since the start.
     turn: Option<Mark>,
-    /// The last mark.
     last: Option<Mark>,
-    /// Number of times without a measured current since the start, and up to the turn.
+    /// Number of periods without a measured current: since the start, and up to the turn.
     gaps: [u32; 2],
     /// Start and end of the last complete span that no cell has learned from yet, and the number of its gaps.
     pub(super) closed: Option<(Mark, Mark, u32)>,
@@ -111,27 +109,26 @@ impl Span {
         marks.chain(self.closed.iter_mut().flat_map(|(start, end, _)| [start, end]))
     }
 
-    /// See [`Self::marks_mut`].
     pub(super) fn marks(&self) -> impl Iterator<Item = &Mark> + Clone {
         let marks = [&self.start, &self.turn, &self.last].into_iter().flatten();
         marks.chain(self.closed.iter().flat_map(|(start, end, _)| [start, end]))
     }
 }
 
-/// A complete span of one cell.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct CellSpan {
     /// The span as one half-cycle; its ends are SOCs by voltage.
     pub(super) half_cycle: HalfCycle,
     ends: [f64; 2],
-    /// Variance of the charge that has flowed while no current was measured (square of a fraction of the capacity).
+    /// Variance of the charge that may have flowed while no current was measured (square of a fraction of the
+    /// capacity).
     uncounted: f64,
 }
 
 impl CellSpan {
     /// The capacity (Ah): counted charge divided by the change of the SOC that the voltages show. `None` if the SOC has
-    /// not changed in the direction of the charge. `soc_error`: error of the SOC by voltage that comes from the loads
-    /// before (fraction).
+    /// not changed in the direction of the charge. `soc_error`: error of the SOC by voltage that the preceding loads
+    /// cause (fraction).
     pub(super) fn capacity(&self, model: &CellModel, config: &CapacityConfig, soc_error: f64) -> Option<Measurement> {
         let Self { half_cycle, ends: [start, end], uncounted } = *self;
         let swing = if half_cycle.mode == Mode::Charge { end - start } else { start - end };
@@ -152,8 +149,8 @@ impl CellSpan {
     }
 }
 
-/// Median over the cells of the change of the SOC by voltage that the counted charge `moved` (fraction, positive =
-/// discharge) does not explain; `None` if no cell has both SOCs.
+/// Change of the SOC by voltage that the counted charge `moved` (fraction, positive = discharge) does not explain, as
+/// the median over the cells. `None` if no cell has both SOC values.
 fn jump(before: &Mark, after: &Mark, moved: f64) -> Option<f64> {
     let cells = before.cells.iter().zip(&after.cells);
     let changes = cells.filter_map(|(a, b)| Some((b.by_voltage? - a.by_voltage? + moved).abs()));
@@ -168,7 +165,8 @@ mod tests {
     use crate::health::learner::CellMark;
     use crate::quantity::Timestamp;
 
-    /// Notes a mark of a cell of 100 Ah at this charge taken out (fraction of the rated capacity) and SOC by voltage.
+    /// Notes a mark of a cell of 100 Ah. `taken`: charge taken out (fraction of the rated capacity). `by_voltage`: SOC
+    /// by voltage.
     fn note(span: &mut Span, from: Mode, [taken, by_voltage]: [f64; 2]) {
         let time_s = 600.0 + span.last.as_ref().map_or(0.0, |last| last.time.since(Timestamp::from_secs(0.0)));
         let mut cell = CellMark::default();
@@ -205,7 +203,7 @@ mod tests {
     #[test]
     fn unseen_use_restarts_span() {
         let mut span = Span::default();
-        // 0.3 has moved unseen.
+        // In the third mark, a charge of 0.3 has moved while no current was measured.
         let trips = [
             (Mode::Unknown, [0.0, 0.9]),
             (Mode::Discharge, [0.2, 0.7]),

@@ -18,9 +18,7 @@ struct ModeCandidate {
 /// A confirmed change of mode.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ModeChange {
-    /// The mode that ended.
     pub from: Mode,
-    /// The mode that began.
     pub to: Mode,
     /// Beginning of the new mode.
     pub since: Timestamp,

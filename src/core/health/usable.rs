@@ -5,9 +5,9 @@
 //! the cut-off from the start, the usable capacity is 0.
 //!
 //! The discharge is simulated with the circuit's equations at constant current until the voltage falls to the cut-off.
-//! The simulation starts from the SOC after a full charge, with relaxed branches. The variance is propagated to first
-//! order from three quantities: the slow ratio (additional resistance ratio of the slowest branch), the capacity and ln
-//! rho (rho is the resistance ratio). Capacity and ln rho are correlated.
+//! The simulation starts from the SOC after a full charge, with relaxed RC branches. The variance is propagated to
+//! first order from three quantities: the capacity, ln rho (rho is the resistance ratio), and the slow ratio
+//! (additional resistance ratio of the slowest branch). Capacity and ln rho are correlated.
 
 use super::UsableConfig;
 use crate::cell::circuit::{BranchAt, aged_terminal_v, soc_after};
@@ -65,7 +65,7 @@ pub fn usable_ah(
     step_ah * f64::from(MAX_STEPS)
 }
 
-/// Usable capacity (Ah) with its variance. `capacity` is the published estimate; its variance may be larger than the
+/// Usable capacity (Ah) with its variance. `capacity` is the published estimate, whose variance may be larger than the
 /// capacity variance in the cell's filter.
 pub fn usable_capacity(
     model: &CellModel,

@@ -1,11 +1,12 @@
 //! Counts how a pack is used, for warranty and resale: time beyond its limits, C-rates, depth of discharge, fast
 //! charges, and rest at a high state of charge.
 //!
-//! In: a [`UseSample`] every 0.1 s, and the half-cycles. Out: a [`UseRecord`] of bounded size that only grows until the
-//! pack is replaced. Currents are per cell (A, positive = discharge), temperatures are in degrees C, times in s.
+//! In: a [`UseSample`] every 0.1 s, and the half-cycles. Out: a [`UseRecord`] of fixed size, whose counts only increase
+//! until the pack is replaced. Currents are per cell. Units: A (positive = discharge), degrees C, s.
 //!
-//! * Time counts only while the program receives ticks. A longer step ([`LONGEST_S`]) is a gap. A gap counts only as
-//!   rest at a high SOC, if its length is known, the pack rested before it, and the SOC is the same after it.
+//! * Time counts only while the program receives ticks. A longer step ([`LONGEST_S`]) is a gap. A gap can count only as
+//!   rest at a high SOC. For this, its length must be known, the pack must have rested before it, and the SOC must be
+//!   the same after it.
 //! * If a value is unknown or doubtful, the time counts as unknown, neither as inside nor as beyond the limits. If only
 //!   some sensors are known, a known value beyond its limit still counts as beyond.
 //! * If a limit is not configured, no time counts as known for this limit.
@@ -18,7 +19,7 @@ use crate::sample::SensorRange;
 
 /// Longest time between two ticks that counts as observed (s). A running program sends ticks more often.
 const LONGEST_S: f64 = 5.0;
-/// An event is at least this time beyond a limit (s), in addition to the longest time that a single reading lasts.
+/// An event is at least this time beyond a limit (s), plus the longest time for which a single reading is valid.
 const EVENT_S: f64 = 1.0;
 /// An event ends after this time within the limit (s), so that a value at the limit is one event, not many.
 const WITHIN_S: f64 = 10.0;
@@ -42,7 +43,8 @@ pub struct LimitUse {
     pub beyond_s: f64,
     /// Part of the time beyond the limit in which the pack was charged (s).
     pub beyond_charging_s: f64,
-    /// Number of events: at least 1 s beyond the limit, without 10 s within it.
+    /// Number of events. An event is at least 1 s beyond the limit, plus the longest time for which a single reading is
+    /// valid. It ends after 10 s within the limit.
     pub events: u64,
 }
 
@@ -50,15 +52,13 @@ pub struct LimitUse {
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(default)]
 pub struct RangeUse {
-    /// Below the lower limit.
     pub below: LimitUse,
-    /// Above the upper limit.
     pub above: LimitUse,
     /// Time in which the value of at least one sensor was unknown or doubtful (s).
     pub unknown_s: f64,
-    /// Lowest value seen, also in a single reading; `None` = no value yet.
+    /// Lowest value, even of a single reading; `None` = no value yet.
     pub lowest: Option<f64>,
-    /// Highest value seen, also in a single reading; `None` = no value yet.
+    /// Highest value, even of a single reading; `None` = no value yet.
     pub highest: Option<f64>,
 }
 
@@ -80,11 +80,10 @@ pub struct CRateUse {
 pub struct HalfCycleUse {
     /// Number of discharges by depth, in tenths of the rated capacity. The last number includes deeper discharges.
     pub discharges: [u64; 10],
-    /// Number of charges.
     pub charges: u64,
     /// Number of charges with a mean C-rate above 1 C.
     pub fast_charges: u64,
-    /// Number of half-cycles with a doubtful current; they are not in the other numbers.
+    /// Number of half-cycles with a doubtful current, which the other numbers do not include.
     pub unknown: u64,
 }
 
@@ -102,7 +101,7 @@ pub struct RestUse {
     pub unknown_s: f64,
 }
 
-/// How a pack was used since the program first ran with it.
+/// Counters of how a pack was used since the program first ran with it.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(default)]
 pub struct UseRecord {
@@ -110,13 +109,12 @@ pub struct UseRecord {
     pub temperature_c: RangeUse,
     /// Voltages of the cells (V).
     pub voltage_v: RangeUse,
-    /// Current per cell (A), positive = discharge: below = charge beyond its limit, above = discharge beyond its limit.
+    /// Current per cell (A), positive = discharge. `below` counts charging currents beyond their limit, `above` counts
+    /// discharging currents beyond their limit.
     pub current_a: RangeUse,
-    /// Time by C-rate of the rated capacity.
+    /// Time by C-rate (current relative to the rated capacity).
     pub c_rate: CRateUse,
-    /// Half-cycles by kind.
     pub half_cycles: HalfCycleUse,
-    /// Rest at a high SOC.
     pub rest: RestUse,
 }
 
@@ -129,13 +127,13 @@ pub struct UseCounter {
     temperature: [Excursion; 2],
     voltage: [Excursion; 2],
     current: [Excursion; 2],
-    /// Latest known SOC of the resting pack; `None` = the pack was used since then.
+    /// Latest known SOC of the resting pack; `None` after a load.
     rest_soc: Option<f64>,
-    /// Length of the gaps since that SOC (s).
+    /// Length of the gaps since this SOC was known (s).
     gap_s: f64,
 }
 
-/// Time beyond a limit since the last event ended, and time within the limit since then (s).
+/// Time beyond a limit since the last event ended, and time within the limit since the value was last beyond it (s).
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Excursion {
@@ -146,13 +144,11 @@ struct Excursion {
 /// Lower and upper limits; `None` = no limit.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct UseLimits {
-    /// Temperature (degrees C).
     pub temperature_c: [Option<f64>; 2],
-    /// Cell voltage (V).
     pub voltage_v: [Option<f64>; 2],
     /// Current per cell (A), positive = discharge.
     pub current_a: [Option<f64>; 2],
-    /// Longest time that a single temperature, voltage and current counts (s).
+    /// Longest time for which a single temperature, voltage and current are valid (s).
     pub max_age_s: [f64; 3],
     /// Largest current of a resting cell (A).
     pub rest_a: f64,
@@ -160,7 +156,7 @@ pub struct UseLimits {
     pub rated_ah: f64,
 }
 
-/// A step of time: its length, and the length of an event (s).
+/// A step of time, and the shortest time beyond a limit that is an event (s).
 #[derive(Debug, Clone, Copy)]
 struct Step {
     step_s: f64,
@@ -171,15 +167,12 @@ struct Step {
 /// Values of the pack at one time; `None` = unknown or doubtful.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct UseSample {
-    /// Temperatures of the sensors (degrees C).
     pub temperature_c: Option<SensorRange>,
-    /// Voltages of the cells (V).
     pub voltage_v: Option<SensorRange>,
     /// Current per cell (A), positive = discharge.
     pub current_a: Option<f64>,
     /// SOC of the pack, fraction.
     pub soc: Option<f64>,
-    /// Whether the pack is charged.
     pub is_charging: bool,
 }
 
@@ -232,8 +225,8 @@ impl UseCounter {
         }
     }
 
-    /// Counts the half-cycle that has ended. `cells`: half-cycle and rated capacity (Ah) of each cell with a certain
-    /// current. The cell with the deepest half-cycle counts.
+    /// Counts the half-cycle that has ended. `cells`: half-cycle and rated capacity (Ah) of each cell whose current is
+    /// not doubtful. The cell with the deepest half-cycle counts.
     pub fn count_half_cycle<'a>(&mut self, cells: impl Iterator<Item = (&'a HalfCycle, f64)>) {
         let counts = &mut self.record.half_cycles;
         let of_cell = |(half, rated_ah): (&HalfCycle, f64)| {
@@ -319,7 +312,7 @@ impl RangeUse {
             (&mut self.below, below, low.map(|low| lowest < low)),
             (&mut self.above, above, high.map(|high| highest > high)),
         ] {
-            // If a sensor is unknown, the known values cannot show that all are within the limit.
+            // If a sensor is unknown, the known values cannot show that all values are within the limit.
             if let Some(is_beyond) = is_beyond.filter(|is_beyond| *is_beyond || is_whole) {
                 limit.add(step, is_beyond, excursion);
             }

@@ -2,27 +2,25 @@
 //! the driver's clock was set back.
 //!
 //! In: the time of each input. Out: the time that the stages use, and a [`TimeJump`] if an input does not closely
-//! follow the previous input. If the time of an input is before the clock's time by at most [`MERGE_TOLERANCE_NS`], the
+//! follow the previous input. An input may be older than the clock's time by up to [`MERGE_TOLERANCE_NS`]. Such an
 //! input is counted and treated as if it had the clock's time.
 
 use super::message::MERGE_TOLERANCE_NS;
 use crate::quantity::Timestamp;
 
-/// Longest time between inputs (including ticks) while the computer is awake (s). This time equals 500 tick periods.
+/// Longest time between inputs, including ticks, while the computer is awake (s): 500 tick periods.
 pub(crate) const ASLEEP_S: f64 = 5.0;
 const ASLEEP_NS: i64 = (ASLEEP_S * 1e9) as i64;
 
 /// Period of the checks that depend only on time (staleness, debounce) (s).
 pub(crate) const HOUSEKEEPING_S: f64 = 0.1;
 
-/// The clock of one monitor.
 #[derive(Debug, Default)]
 pub(crate) struct Clock {
-    /// Whether an input has arrived.
     pub(crate) has_started: bool,
     /// Time of the latest input that had an effect.
     pub(crate) now: Timestamp,
-    /// Number of inputs whose time is before the time of an earlier input.
+    /// Number of inputs whose time was before the clock's time.
     pub(crate) time_backwards: u64,
     /// Time at which a tick next has an effect; `None` before the first input.
     pub(crate) due: Option<Timestamp>,

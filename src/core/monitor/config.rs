@@ -29,7 +29,6 @@ pub struct MonitorConfig {
     pub answers: Vec<Answer>,
     /// Diagnostic requests to send; `None` = the daemon sends no requests.
     pub poll: Option<PollConfig>,
-    /// Supply voltage required before requests are sent.
     pub supply: Option<SupplyConfig>,
     /// Input messages with end-to-end protection.
     pub guards: Vec<GuardConfig>,
@@ -41,11 +40,9 @@ pub struct MonitorConfig {
     pub flood: FloodConfig,
     /// Duration of silence on all inputs (s) after which the buses count as asleep if no current flows; `None` = never.
     pub asleep_after_s: Option<f64>,
-    /// Settings of the sampling stage.
     pub sample: SampleConfig,
-    /// Cell model.
     pub model: CellModel,
-    /// Cells of another kind, with their own models.
+    /// Modules of cells of another kind, with their own models.
     pub modules: Vec<CellModule>,
     /// Label of the cells, the starting point for learning their model; `None` = the model comes from a model file.
     pub label: Option<Label>,
@@ -55,11 +52,9 @@ pub struct MonitorConfig {
     pub is_balanced: bool,
     /// Meaning of the balancing bits in `input`; `None` = `input` has no balancing bits.
     pub balancing: Option<BalancingConfig>,
-    /// Settings of the estimator.
     pub estimator: EstimatorConfig,
     /// Settings of the learning stage, which learns at changes between charge and discharge.
     pub health: HealthConfig,
-    /// Alarm rules.
     pub rules: Vec<RuleConfig>,
     /// Frames to send; `None` = the daemon only listens.
     pub output: Option<OutputConfig>,
@@ -96,14 +91,14 @@ pub struct OutputConfig {
     pub buses: Vec<BusIndex>,
     /// Period of the status frame (s).
     pub status_period_s: f64,
-    /// Period of the health frame (all its pages) (s).
+    /// Period of the health frame with all its pages (s).
     pub health_period_s: f64,
     /// Period of the alarm frames (s). Each raised alarm is sent once per period if the limit on the rate of alarm
     /// frames allows it.
     pub alarm_period_s: f64,
-    /// Period of the digest (all its pages) (s).
+    /// Period of the digest with all its pages (s).
     pub digest_period_s: f64,
-    /// Whether cyclic frames are sent while the buses sleep. They would keep other nodes awake.
+    /// Whether cyclic frames are sent while the buses sleep. Such frames keep other nodes awake.
     pub while_asleep: bool,
 }
 
@@ -123,9 +118,7 @@ pub struct J1939Config {
 /// Trouble code of the alarms of one threshold.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct AlarmCode {
-    /// The rule.
     pub rule: Rule,
-    /// The threshold's severity.
     pub severity: Severity,
     /// The trouble code; its occurrence count is 0.
     pub code: TroubleCode,
@@ -167,12 +160,12 @@ impl MonitorConfig {
         module.map_or(&self.model, |module| &module.model)
     }
 
-    /// Whether a cell is of the pack's own kind, that is, not in a module of another kind.
+    /// Whether a cell is not in a module of another kind.
     pub fn is_own(&self, cell: CellIndex) -> bool {
         !self.modules.iter().any(|module| module.cells.contains(&cell))
     }
 
-    /// Number of cells of the pack's own kind, that is, not in a module of another kind.
+    /// Number of cells that are not in a module of another kind.
     pub fn own_cells(&self) -> u32 {
         let in_modules: usize = self.modules.iter().map(|module| module.cells.len()).sum();
         u32::from(self.sample.cells).saturating_sub(u32::try_from(in_modules).unwrap_or(u32::MAX))
@@ -236,7 +229,6 @@ impl MonitorConfig {
         command.map(|secoc| (LayoutMessage::Command, secoc)).into_iter().chain(sent).collect()
     }
 
-    /// Checks whether a monitor of this configuration can continue with `new`.
     pub(crate) fn check_fits(&self, new: &Self) -> Result<(), ReconfigureError> {
         let (old_sample, new_sample) = (&self.sample, &new.sample);
         let counts = [
@@ -295,7 +287,6 @@ impl MonitorConfig {
             && self.sample.ambient_c == new.sample.ambient_c
     }
 
-    /// The tables whose settings differ in `new`.
     pub(crate) fn changed_tables(&self, new: &Self) -> Vec<&'static str> {
         let (old_sample, new_sample) = (&self.sample, &new.sample);
         let limits = |sample: &SampleConfig| {

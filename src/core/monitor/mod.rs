@@ -9,9 +9,9 @@
 //! ```
 //!
 //! * `message`: inputs and outputs, independent of the stages;
-//! * `stage`: the stages; each stage knows only the stages before it;
-//! * `stages`: connects the stages after the intake, passes the values of these stages to the alarm rules, and
-//!   remembers exchanged packs;
+//! * `stage`: the stages; each stage depends only on the stages before it;
+//! * `stages`: connects the stages after the intake, passes their values to the alarm rules, and remembers exchanged
+//!   packs;
 //! * `snapshot`: the stored state;
 //! * `lifecycle`: restores a stored state, relearns from a history, and applies a new configuration;
 //! * `clock`, `config`, `view`: time, configuration and present values of the whole monitor.
@@ -74,7 +74,7 @@ const EARLIEST: Timestamp = Timestamp::from_nanos(-LATEST.nanos());
 const LATEST: Timestamp = Timestamp::from_nanos(bounds::STAMP_NS.high as i64);
 
 impl Monitor {
-    /// Creates a monitor without any knowledge of its pack.
+    /// Creates a monitor that has not learned anything yet.
     pub fn new(config: MonitorConfig) -> Self {
         let (intake, stages) = (Intake::new(&config), Stages::new(&config));
         Self { config, clock: Clock::default(), intake, stages, pending: None }
@@ -126,7 +126,6 @@ impl Monitor {
         }
     }
 
-    /// Advances the clock to a frame's time and handles the frame.
     #[inline]
     fn handle_frame_at(
         &mut self,
@@ -151,7 +150,7 @@ impl Monitor {
         }
     }
 
-    /// Handles a frame: passes its readings to the stages, or executes its command.
+    /// Passes the readings of a frame to the stages, or executes the command in the frame.
     fn handle_frame(&mut self, received: ReceivedFrame<'_>, out: &mut Outputs) {
         let Self { config, clock, intake, stages, .. } = self;
         let found =
@@ -197,9 +196,9 @@ impl Monitor {
         }
     }
 
-    /// Handles a frame of diagnostic requests and answers. The values of an answer count as measured at the time of the
-    /// answer's first frame: by then, the controller has assembled the answer. The times of the remaining frames only
-    /// depend on the tester's flow control.
+    /// Handles a frame of diagnostic requests and answers. The values of an answer count as measured at the time of its
+    /// first frame, because the controller has assembled the answer by then. The times of the remaining frames depend
+    /// only on the tester's flow control.
     fn handle_diagnostic(&mut self, bus: BusIndex, frame: &Frame, out: &mut Outputs) {
         let Self { clock, intake, stages, .. } = self;
         let (now, Intake { listener, moments, controllers, .. }) = (clock.now, &mut *intake);
@@ -233,7 +232,7 @@ impl Monitor {
         intake.report(now, out);
     }
 
-    /// Handles ticks, commands, store and interface reports.
+    /// Handles ticks, commands, and reports about files and interfaces.
     fn handle_occasional(&mut self, kind: &RecordKind, out: &mut Outputs) {
         let Self { config, intake, stages, .. } = self;
         let now = self.clock.now;
@@ -279,8 +278,8 @@ impl Monitor {
         }
     }
 
-    /// Freshness of the last authenticated frame. The driver must store the state before this number has risen by
-    /// [`RESTART_FRESHNESS`] since the last stored state.
+    /// Freshness value of the last authenticated frame that was sent. The driver must store the state before this value
+    /// has risen by [`RESTART_FRESHNESS`] since the last stored state. Otherwise, a restart could use a value twice.
     pub fn sent_freshness(&self) -> u64 {
         self.stages.sending.schedule.sent_freshness
     }
@@ -296,9 +295,9 @@ impl Monitor {
         is_command.then(|| self.intake.command_gate.mac_check(secoc, frame.data()))
     }
 
-    /// The model fit that has just started; returned once. A fit takes too long for one tick, so a live driver runs
-    /// the fit on another thread and passes the findings to [`Self::give_model_fit`]. Otherwise, the monitor runs the
-    /// fit when it is due, with the same result.
+    /// The model fit that has just started; returned once. A fit takes too long for one tick. A live driver therefore
+    /// runs the fit on another thread and passes the findings to [`Self::give_model_fit`]. If no driver takes the fit,
+    /// the monitor runs the fit when it is due, with the same result.
     pub fn take_model_fit(&mut self) -> Option<FitTask> {
         self.stages.modelling.take_task()
     }
@@ -308,8 +307,8 @@ impl Monitor {
         self.stages.modelling.give(task, findings);
     }
 
-    /// Steps the cells that have a waiting sample, without waiting for the other cells. The core itself does this
-    /// before it uses estimates. A driver calls this function after the last input.
+    /// Runs the filters on samples that wait for the samples of other cells. The core itself does this before it uses
+    /// estimates. A driver calls this function after the last input.
     pub fn settle(&mut self, out: &mut Outputs) {
         let first_event = out.events.len();
         self.stages.step_waiting(self.clock.now, true, out);
@@ -327,7 +326,7 @@ impl Monitor {
         self.clock.due = self.clock.has_started.then(|| self.stages.sending.next_due());
     }
 
-    /// Starts at the time of the first input, from the pending stored state, if any.
+    /// Starts at the time of the first input. If a stored state is pending, continues from that state.
     fn start(&mut self, time: Timestamp, out: &mut Outputs) {
         (self.clock.has_started, self.clock.now) = (true, time);
         self.stages.sending.restart(time);
@@ -374,7 +373,6 @@ impl Monitor {
         self.stages.sending.schedule.begin_freshness(now);
     }
 
-    /// Advances the clock to the time of an input.
     #[inline]
     fn advance(&mut self, time: Timestamp, out: &mut Outputs) {
         if let Some(jump) = self.clock.advance(time) {
@@ -409,7 +407,6 @@ impl Monitor {
         self.stages.fall_asleep(now, out);
     }
 
-    /// Continues at `time` after a gap of unknown length.
     fn handle_unknown_gap(&mut self, time: Timestamp, out: &mut Outputs) {
         self.fall_asleep(out);
         // The age of the last rejected command is now unknown.

@@ -1,4 +1,4 @@
-//! The monitor's state as a versioned document: contents and checks.
+//! The stored state of the monitor: contents and checks.
 //!
 //! In: a [`Snapshot`] from a store or a file. Out: a monitor that continues from the snapshot at its first input, or
 //! the reason why the snapshot cannot be used. Vehicles store snapshots as JSON, so names and order of the fields must
@@ -27,13 +27,12 @@ use crate::sample::{CellSample, SampleConfig};
 
 /// Name of the charge that [`Snapshot::check_charges`] checks, for error messages.
 const CHARGE: &str = "the charge since a cell's latest voltage or half-cycle";
-/// Factor by which a charge may exceed the largest plausible charge, because the limits of the current may have been
-/// wider when the charge was counted.
+/// Factor by which a charge may exceed the largest plausible charge. The limits of the current may have been wider when
+/// the charge was counted.
 const CHARGE_TOLERANCE: f64 = 2.0;
-/// Time that is added to the time in which the charge has moved, because the clock may have been set (s).
+/// Tolerance of the time during which a charge has moved (s). The clock may have been set in this time.
 const CHARGE_TOLERANCE_S: f64 = 1000.0;
 
-/// Layout version of [`Snapshot`].
 pub(crate) const SNAPSHOT_VERSION: u32 = 1;
 
 /// State of a [`Monitor`](crate::monitor::Monitor) at one moment: the states of its stages.
@@ -52,12 +51,12 @@ pub struct Snapshot {
     pub(crate) sampling: SamplingState,
     pub(crate) estimation: EstimationState,
     pub(crate) cells: Vec<StoredCell>,
-    /// State of the modelling stage; `None` if the cells' model comes from a model file.
+    /// State of the modelling stage; `None` if the cell model comes from a model file.
     pub(crate) modelling: Option<ModellingState>,
     pub(crate) learning: LearningState,
     /// State of the cell-fault detector; `None` if the pack is too small for a comparison.
     pub(crate) diagnosis: Option<CellFaultDetector>,
-    /// State of the watch for a thermal event; `None` without its rule, and in a state for a restart.
+    /// State of the thermal-event detector; `None` without its rule, and in a state for a restart.
     pub(crate) thermal: Option<ThermalWatch>,
     pub(crate) alarming: StoredAlarming,
     pub(crate) sending: SendingState,
@@ -76,13 +75,10 @@ pub enum RestoreError {
     /// A number in the snapshot is impossible, so the snapshot is damaged.
     #[error("snapshot is damaged: {what}{} = {found:?}, must be {allowed}", .cell.map(|cell| format!(" (cell {cell})")).unwrap_or_default())]
     Number {
-        /// Name of the number.
         what: &'static str,
         /// Cell, counted from 0; `None` if the number does not belong to a single cell.
         cell: Option<usize>,
-        /// Value of the number.
         found: f64,
-        /// Allowed values.
         allowed: &'static str,
     },
 }
@@ -114,8 +110,8 @@ pub(crate) struct PendingRestore {
 }
 
 impl Snapshot {
-    /// Drops everything that is valid only if the same clock continues. A program stores the (smaller) result before it
-    /// restarts.
+    /// Drops everything that is valid only if the same clock continues. A program stores this smaller snapshot before
+    /// it restarts.
     #[must_use]
     pub fn for_restart(self) -> Self {
         let mut restarted = Self { may_continue: false, ..self };
@@ -144,7 +140,7 @@ impl Snapshot {
         self.diagnosis.as_ref()
     }
 
-    /// Capacity that the pack loses to differences between its cells; `None` without a cell-fault detector.
+    /// Capacity that the pack loses because its cells differ; `None` without a cell-fault detector.
     pub fn imbalance(&self) -> Option<Result<Imbalance, UnknownImbalance>> {
         let mut capacities: Vec<ScalarGaussian> =
             (0..self.cells.len()).map(|cell| self.learning.learner.capacity(cell)).collect();
@@ -183,8 +179,8 @@ impl Snapshot {
         self.sampling.sampler.wiring()
     }
 
-    /// State of the cells' model. `label`: the configured label, which is used if the stored state has no fit. `None`
-    /// if the model comes from a model file, or if the label is unknown.
+    /// State of the cell model. `label`: the configured label, which is used if the stored state has no fit. `None` if
+    /// the model comes from a model file, or if the label is unknown.
     ///
     /// # Errors
     /// The first number that is out of range.
@@ -194,15 +190,14 @@ impl Snapshot {
         Ok(stored.stored_view(label))
     }
 
-    /// Whether the waiting samples agree with the cells: each cell has at most one waiting sample, and each cell with a
-    /// waiting sample is in the snapshot and has reported in the unfinished batch.
+    /// Whether the waiting samples fit the snapshot: each cell has at most one waiting sample, and every cell with a
+    /// waiting sample exists and has reported in the unfinished batch.
     pub(crate) fn waiting_fits(&self) -> bool {
         let mut has_come: Vec<bool> = self.cells.iter().map(|cell| cell.updated_in_round).collect();
         let mut is_first = |cell: usize| has_come.get_mut(cell).is_some_and(std::mem::take);
         self.estimation.waiting.iter().all(|sample| is_first(sample.cell.index()))
     }
 
-    /// Checks that every number is possible.
     pub(crate) fn check(&self) -> Result<(), RestoreError> {
         for (cell, stored) in self.cells.iter().enumerate() {
             stored.check().map_err(|invalid| at_cell(cell, invalid))?;
@@ -226,7 +221,7 @@ impl Snapshot {
     pub(crate) fn check_charges(&self, config: &SampleConfig) -> Result<(), RestoreError> {
         let (strings, limits) = (f64::from(config.strings.max(1)), &config.current);
         let most_a = limits.min.abs().max(limits.max.abs()) / strings;
-        // The charge stored with a cell's latest voltage was counted as if the latest current reading lasted until that
+        // The charge stored with a cell's latest voltage assumes that the latest current reading lasted until that
         // voltage. Count in the same way up to the time of the state.
         let charge_as = self.sampling.sampler.charge_as(self.time, limits.max_age_s) / strings;
         let check = |time: Timestamp, before_as: f64| {
@@ -242,7 +237,6 @@ impl Snapshot {
         Ok(self.learning.learner.marks().try_for_each(|(time, charge_as)| check(time, charge_as))?)
     }
 
-    /// Shifts all timestamps by `by_nanos`.
     pub(crate) fn rebase(&mut self, by_nanos: i64) {
         self.time = self.time.plus_nanos(by_nanos);
         for consumed in self.cells.iter_mut().filter_map(|cell| cell.consumed.as_mut()) {

@@ -1,7 +1,7 @@
 //! Connects the stages after the intake: readings → samples → estimates → health → alarms → frames.
 //!
-//! Each stage owns its configuration and state; only this file knows the order of the stages. In all functions, `now`
-//! is the time of the input that is being handled.
+//! Each stage owns its configuration and state. Only this file depends on the order of the stages. In all functions,
+//! `now` is the time of the input that is being handled.
 
 mod outlook;
 pub(crate) mod pack_memory;
@@ -32,7 +32,6 @@ use crate::quantity::catalogue::PackValues;
 use crate::quantity::{BusIndex, CellIndex, Channel, Mode, Reading, Timestamp};
 use crate::sample::{CellSample, Moment};
 
-/// All stages after the intake.
 #[derive(Debug)]
 pub(crate) struct Stages {
     pub(crate) sampling: Sampling,
@@ -77,7 +76,6 @@ impl Stages {
         (&mut self.learning, publisher)
     }
 
-    /// Passes a reading to the stages that use its channel.
     #[inline]
     pub(crate) fn handle_reading(&mut self, now: Timestamp, bus: BusIndex, reading: Reading, out: &mut Outputs) {
         match reading.channel {
@@ -96,7 +94,7 @@ impl Stages {
         }
     }
 
-    /// Passes a received frame and the state of the car to the poller.
+    /// Passes a received frame and the state of the car to the poller, which sends the diagnostic requests.
     pub(crate) fn poll_after_frame(&mut self, now: Timestamp, bus: BusIndex, frame: &Frame, out: &mut Outputs) {
         let state = self.car_state();
         self.sending.poll_with(now, out, |poller, out| {
@@ -105,7 +103,6 @@ impl Stages {
         });
     }
 
-    /// State of the car, from the pack's mode.
     fn car_state(&self) -> CarState {
         match self.learning.mode() {
             Mode::Discharge => CarState::Drive,
@@ -115,7 +112,7 @@ impl Stages {
     }
 
     /// Handles a reading of a diagnostic answer. If `moment` is given, a voltage counts as measured at that earlier
-    /// moment.
+    /// time.
     pub(crate) fn handle_answer_reading(
         &mut self,
         now: Timestamp,
@@ -156,8 +153,8 @@ impl Stages {
         out.events.push(Event { time: now, kind: EventKind::PackIdentity { identity } });
     }
 
-    /// Adds a sample to the batch. If the cell has already reported, steps the old batch first. If every cell has now
-    /// reported, steps the batch.
+    /// Adds a sample to the batch, which holds one sample per cell. If the cell already has a sample in the batch, runs
+    /// the filters on the old batch first. If every cell now has a sample, runs the filters.
     #[inline]
     fn handle_sample(&mut self, now: Timestamp, sample: CellSample, out: &mut Outputs) {
         if !self.estimation.batch.awaits(sample.cell) {
@@ -169,7 +166,6 @@ impl Stages {
         }
     }
 
-    /// Steps the batch and combines the pack's values.
     #[inline(never)]
     fn complete_batch(&mut self, now: Timestamp, out: &mut Outputs) {
         self.step_waiting(now, true, out);
@@ -180,8 +176,8 @@ impl Stages {
         learning.combine_pack(all_fresh, &estimation.bank, &mut Publisher { now, alarming, sending, out });
     }
 
-    /// Steps the cells that have a waiting sample, without waiting for the other cells. Callers do this before they use
-    /// estimates. `is_current`: whether the samples are recent; if not, the rule on innovations does not judge them.
+    /// Runs the filters on the waiting samples, without waiting for the other cells. Callers do this before they use
+    /// estimates. If the samples are not recent (`is_current` is false), the rule on innovations does not judge them.
     pub(crate) fn step_waiting(&mut self, now: Timestamp, is_current: bool, out: &mut Outputs) {
         if self.estimation.batch.waiting.is_empty() {
             return;
@@ -207,7 +203,6 @@ impl Stages {
         }
     }
 
-    /// Handles the result of a cell's step.
     fn handle_step(&mut self, now: Timestamp, sample: &CellSample, out: &mut Outputs) {
         if self.estimation.record(sample) {
             out.events.push(Event { time: now, kind: EventKind::FilterReset { cell: sample.cell } });
@@ -219,12 +214,13 @@ impl Stages {
         }
     }
 
-    /// A cell's estimate after its latest step; `None` before its first step.
+    /// A cell's estimate after its latest sample; `None` before its first sample.
     pub(crate) fn estimate(&self, index: usize) -> Option<Estimate> {
         self.estimation.estimate(index, self.learning.capacity(index))
     }
 
-    /// Passes the pack current (`None` if stale) to the mode detector. When the mode changes, the cells learn.
+    /// Passes the pack current (`None` if stale) to the mode detector. When the mode changes, the learning stage
+    /// evaluates the mode that ended.
     fn observe_current(&mut self, now: Timestamp, current_a: Option<f64>, out: &mut Outputs) {
         let Learning { config, state, .. } = &mut self.learning;
         let observed = state.detector.observe(&config.transition, now, current_a);
@@ -265,8 +261,7 @@ impl Stages {
         }
     }
 
-    /// Fits the cell model to the rows that the modelling stage has collected. If the fit changes the model, the
-    /// estimators adopt the new model.
+    /// Fits the cell model to the collected data. If the fit changes the model, the estimators adopt the new model.
     fn learn_model(&mut self, now: Timestamp, out: &mut Outputs) {
         self.step_waiting(now, true, out);
         let Self { estimation, modelling, learning, .. } = self;
@@ -283,8 +278,8 @@ impl Stages {
         }
     }
 
-    /// Passes the capacity of every cell outside the modules to the capacity rules. Called when a new model has changed
-    /// the capacities of these cells.
+    /// Passes the capacities of all cells to the capacity rules, except cells in modules of another kind. Called when a
+    /// new model has changed the capacities.
     fn restate_capacities(&mut self, now: Timestamp, out: &mut Outputs) {
         for index in self.estimation.bank.own_cells().to_vec() {
             let capacity = self.learning.learned_capacity(index);
@@ -302,7 +297,6 @@ impl Stages {
         }
     }
 
-    /// Executes a command.
     pub(crate) fn handle_command(
         &mut self,
         now: Timestamp,
@@ -312,7 +306,7 @@ impl Stages {
     ) -> CommandOutcome {
         self.step_waiting(now, true, out);
         if command == Command::PackReplaced {
-            // The values put aside belong to the old pack, so drop them regardless of the pack number.
+            // Learned values that were put aside belong to the old pack, so drop them regardless of the pack number.
             self.packs.drop_aside();
         }
         let CommandOutcome { changed, refused } = match command {
@@ -370,8 +364,8 @@ impl Stages {
         self.estimation.batch.begin();
     }
 
-    /// Ends everything in progress, because no reading follows for a while; `now` is the time of the last input. The
-    /// mode becomes unknown, recharge periods are not timed across the gap, and the pack's values become unknown until
+    /// Ends everything in progress, because no reading follows for a while. `now` is the time of the last input. The
+    /// mode becomes unknown, and recharge periods are not timed across the gap. The pack's values become unknown until
     /// every cell has a new reading.
     pub(crate) fn fall_asleep(&mut self, now: Timestamp, out: &mut Outputs) {
         self.observe_current(now, None, out);
@@ -388,7 +382,6 @@ impl Stages {
         self.findings.interrupt_thermal();
     }
 
-    /// Continues at `time` after being asleep.
     pub(crate) fn wake(&mut self, time: Timestamp, out: &mut Outputs) {
         self.sampling.sampler.wake(time);
         self.sending.restart(time);
@@ -405,7 +398,6 @@ impl Stages {
         self.learning.state.use_counter.interrupt();
     }
 
-    /// Continues at `time` after a gap of unknown length.
     pub(crate) fn end_unknown_gap(&mut self, time: Timestamp, out: &mut Outputs) {
         self.sampling.sampler.handle_gap(time);
         self.sending.restart(time);
@@ -415,8 +407,7 @@ impl Stages {
         self.findings.interrupt_thermal();
     }
 
-    /// Runs the checks that depend only on time: the ages of the inputs, the minimum duration of the mode, and the
-    /// alarms.
+    /// Runs the checks that depend only on time: ages of the inputs, minimum duration of the mode, and alarms.
     pub(crate) fn run_housekeeping(
         &mut self,
         now: Timestamp,
@@ -438,8 +429,6 @@ impl Stages {
             // A cell without a fresh voltage may be the cell that limits the pack.
             self.forget_pack_state();
         }
-        // A frozen or contradicted reading of the current, or a message with a second sender, makes the estimates
-        // doubtful.
         let is_current_frozen = self.sampling.sampler.is_current_frozen();
         let is_contradicted = self.estimation.current_check.is_doubtful();
         self.estimation.is_current_doubtful = self.sampling.has_second_sender || is_current_frozen || is_contradicted;
@@ -451,7 +440,6 @@ impl Stages {
         self.watch_computer(now, bus_fault, out);
     }
 
-    /// Sends the frames that are due.
     pub(crate) fn send_due(&mut self, now: Timestamp, out: &mut Outputs) {
         self.sending.poll_j1939(now, out);
         let state = self.car_state();
@@ -489,7 +477,6 @@ impl Stages {
         self.sending.continue_test(now, &self.alarming.engine, out);
     }
 
-    /// Validity of the published estimates.
     pub(crate) fn validity(&self) -> Validity {
         if self.learning.state.pack.is_none() {
             Validity::Unavailable
@@ -509,7 +496,7 @@ impl Stages {
             soc_std: pack.map(|pack| pack.soc_std),
             mode: Some(self.learning.mode()),
             validity: self.validity() as u8,
-            // Without an estimate, "no alarm" would be unfounded.
+            // Without an estimate, 0 (no alarm) would be unfounded, so the field is unknown.
             highest_severity: engine.highest_severity().map(|severity| severity as u8).or(pack.map(|_| 0)),
             active_alarms: Some(u16::try_from(engine.count()).unwrap_or(u16::MAX)),
             limiting_cell: pack.map(|pack| pack.limiting_cell),
@@ -521,7 +508,7 @@ impl Stages {
         }
     }
 
-    /// Judges whether the silence of all inputs is a sleep.
+    /// Judges whether the silence of all inputs means that the vehicle sleeps.
     pub(crate) fn silence(&self, now: Timestamp) -> Silence {
         let Some(after_s) = self.sleep.after_s else { return Silence::None };
         if self.sleep.since.is_some() {
@@ -530,7 +517,7 @@ impl Stages {
         let sampler = &self.sampling.sampler;
         let transition = &self.learning.config.transition;
         let rest_a = transition.dead_band_a + transition.hysteresis_a;
-        // Silence before the first reading is not a sleep, because the wiring may be wrong.
+        // Before the first reading, silence does not count as sleep, because the wiring may be wrong.
         let Some(silent_s) = sampler.all_silent_s(now, QUIET_S) else { return Silence::None };
         if sampler.latest_current_a(now).is_none_or(|current_a| current_a.abs() > rest_a) {
             return Silence::None;
@@ -538,14 +525,13 @@ impl Stages {
         if silent_s > after_s { Silence::Begins } else { Silence::Quiet }
     }
 
-    /// Starts a bus sleep.
     pub(crate) fn begin_bus_sleep(&mut self, now: Timestamp, out: &mut Outputs) {
         self.sleep.since = Some(now);
         self.fall_asleep(now, out);
         out.events.push(Event { time: now, kind: EventKind::BusAsleep { asleep: true, seconds: None } });
     }
 
-    /// Ends the bus sleep after a reading.
+    /// Ends the bus sleep. Called at the first reading after the sleep.
     #[cold]
     pub(crate) fn end_bus_sleep(&mut self, now: Timestamp, out: &mut Outputs) {
         let Some(since) = self.sleep.since.take() else { return };

@@ -1,5 +1,5 @@
-//! Methods of the monitor that return present values of cells and pack, for status, tables and reports. `None` = not
-//! known yet, or no longer known.
+//! Methods of the monitor that return present values of the cells and the pack for status, tables and reports. `None`
+//! means that a value is not known yet, or no longer known.
 
 use super::Monitor;
 use super::config::CommandConfig;
@@ -31,12 +31,12 @@ impl Monitor {
         self.clock.now
     }
 
-    /// Number of inputs whose time is before the time of an earlier input.
+    /// Number of inputs whose time was before the time of the latest input.
     pub fn time_backwards(&self) -> u64 {
         self.clock.time_backwards
     }
 
-    /// Per protected input message: how often the check had each result.
+    /// Results of the end-to-end check, counted for each protected input message.
     pub fn protected(&self) -> impl Iterator<Item = GuardCounts> + '_ {
         self.intake.protected()
     }
@@ -46,8 +46,8 @@ impl Monitor {
         self.config.commands.as_ref()
     }
 
-    /// The authenticated command message and the results of checking its frames; `None` = commands are not
-    /// authenticated.
+    /// The authenticated command message (interface, identifier) and the results of checking its frames. `None` if
+    /// commands are not authenticated.
     pub fn authenticated_commands(&self) -> Option<(BusIndex, CanId, CommandCounts)> {
         let commands = self.config.commands.as_ref().filter(|commands| commands.plan.authentication().is_some())?;
         Some((commands.bus, commands.plan.id(), self.intake.command_gate.counts))
@@ -58,12 +58,12 @@ impl Monitor {
         self.intake.dropped()
     }
 
-    /// Input messages with a second sender, each with its interface.
+    /// Input messages with a second sender: interface and identifier.
     pub fn second_senders(&self) -> impl Iterator<Item = (BusIndex, CanId)> + '_ {
         self.intake.second_senders()
     }
 
-    /// Interfaces on which another node uses identifiers of the daemon's frames, with the latest such identifier.
+    /// Interfaces on which another node uses an identifier of the daemon, and the latest such identifier.
     pub fn own_id_uses(&self) -> impl Iterator<Item = (BusIndex, CanId)> + '_ {
         self.intake.own_id_uses()
     }
@@ -78,7 +78,7 @@ impl Monitor {
         self.intake.controllers()
     }
 
-    /// State of the cells' model.
+    /// State of the cell model.
     pub fn model(&self) -> ModelView<'_> {
         self.stages.modelling.view()
     }
@@ -88,13 +88,13 @@ impl Monitor {
         self.stages.findings.diagnosis.findings()
     }
 
-    /// A cell's difference from its pack; `None` if the cell is not compared.
+    /// A cell's difference from the other cells; `None` if the cell is not compared with them.
     pub fn difference(&self, cell: CellIndex) -> Option<&Difference> {
         self.stages.findings.diagnosis.difference(cell)
     }
 
     /// Reason why the daemon sends no diagnostic requests (`None` if it sends them), and number of requests that are
-    /// refused permanently. `None` without `[poll]`.
+    /// never sent again. The whole result is `None` without `[poll]`.
     pub fn poll(&self) -> Option<(Option<PollSilence>, usize)> {
         self.stages.sending.poller.as_ref().map(|poller| (poller.silence(), poller.refused()))
     }
@@ -114,15 +114,15 @@ impl Monitor {
         self.stages.sampling.has_usable_reading
     }
 
-    /// Configured signals whose last good value is too old, because no reading arrived or all readings were bad. A
-    /// signal that has never had a reading counts once the time since the start or the last waking exceeds the signal's
-    /// maximum age.
+    /// Configured signals whose last good value is too old, because no reading arrived or all readings were bad. If a
+    /// signal has never had a reading, its age counts from the start or the last waking.
     pub fn lost_inputs(&self) -> impl Iterator<Item = Channel> + '_ {
         let sampler = &self.stages.sampling.sampler;
         sampler.channels().iter().copied().filter(|&channel| sampler.is_lost(channel, self.now()))
     }
 
-    /// The latest good reading of every signal that has had a good reading, at any age: channel, time, value.
+    /// Channel, time and value of the latest good reading of every signal, at any age. Omits signals without a good
+    /// reading.
     pub fn latest_readings(&self) -> impl Iterator<Item = (Channel, Timestamp, f64)> + '_ {
         self.stages.sampling.sampler.latest_readings()
     }
@@ -142,13 +142,13 @@ impl Monitor {
         self.stages.sampling.identity.known
     }
 
-    /// The latest estimate of every cell, for live tables; `None` before a cell's first estimate. Samples that still
-    /// wait for their step are not included; [`settle`](Self::settle) steps them.
+    /// The latest estimate of every cell; `None` before a cell's first estimate. Samples that wait for the filter are
+    /// not included; call [`settle`](Self::settle) first to include them.
     pub fn latest(&self) -> impl Iterator<Item = Option<super::Estimate>> {
         (0..self.stages.estimation.cells()).map(|index| self.stages.estimate(index))
     }
 
-    /// Values of the pack, from its limiting cells; `None` unless every cell has an estimate and a fresh voltage.
+    /// Values of the pack; `None` unless every cell has an estimate and a fresh voltage.
     pub fn pack(&self) -> Option<&PackState> {
         self.stages.learning.state.pack.as_ref()
     }
@@ -158,23 +158,23 @@ impl Monitor {
         self.stages.learning.mode()
     }
 
-    /// The last recorded recharge period (s).
+    /// The last recorded recharge period (s): time that a charge took between two configured SOC values.
     pub fn recharge_period_s(&self) -> Option<f64> {
         self.stages.learning.state.recharge_period_s
     }
 
-    /// Time (s) that the reference charger needs for the recharge window. The value was learned from the last charge
-    /// that covered enough of the window.
+    /// Time (s) that the reference charger needs for the recharge window (a configured SOC range). Learned from the
+    /// last charge that covered enough of the window.
     pub fn normalised_recharge_period(&self) -> Option<ScalarGaussian> {
         self.stages.learning.state.normalised_recharge
     }
 
-    /// Usable capacity of a cell (Ah) after its last discharge; before the first discharge, after the first charge.
+    /// Usable capacity of a cell (Ah), updated after every discharge. The first value may come from a charge.
     pub fn usable_capacity(&self, cell: CellIndex) -> Option<ScalarGaussian> {
         self.stages.learning.cells.get(cell.index())?.usable
     }
 
-    /// Published capacity of a cell (Ah).
+    /// Learned capacity of a cell (Ah); before the first learning step, the model's capacity.
     pub fn capacity(&self, cell: CellIndex) -> ScalarGaussian {
         self.stages.learning.capacity(cell.index())
     }
@@ -189,8 +189,8 @@ impl Monitor {
             .and_then(|it| estimation.bank.model(cell.index()).loss_modes(it))
     }
 
-    /// Offset of the pack's current sensor (A): reading minus true current, positive = discharge. `None` before
-    /// anything was learned.
+    /// Offset of the pack's current sensor (A): reading minus true current, positive = discharge. `None` until an
+    /// offset has been learned.
     pub fn current_offset(&self) -> Option<ScalarGaussian> {
         let Stages { sampling, learning, .. } = &self.stages;
         let strings = f64::from(sampling.sampler.config().strings);
@@ -211,7 +211,7 @@ impl Monitor {
         self.stages.learning.lives.of_pack()
     }
 
-    /// How the connected pack was used.
+    /// Counters of how the connected pack was used.
     pub fn use_record(&self) -> &UseRecord {
         self.stages.learning.state.use_counter.record()
     }
@@ -313,7 +313,7 @@ impl Monitor {
     }
 }
 
-/// Sets the counts of use. A count is unknown until it could have been above 0.
+/// Sets the counters of use. A counter is unknown until the values that it depends on have been measured.
 fn set_use(values: &mut PackValues, record: &UseRecord) {
     let UseRecord { temperature_c, voltage_v, current_a, half_cycles, rest, .. } = record;
     let is_judged = [temperature_c, voltage_v, current_a].iter().all(|it| it.below.known_s + it.above.known_s > 0.0);

@@ -1,17 +1,16 @@
 //! Physical bounds of the quantities of cells, sensors and clocks.
 //!
-//! The same bounds apply to configuration keys, cell models, stored states and running filters. A filter whose state
-//! leaves its bounds restarts. The bounds are wide: a number outside is certainly wrong, but a number inside may be
-//! wrong, too.
+//! The same bounds apply to configuration keys, cell models, stored states and running filters. If the state of a
+//! filter leaves its bounds, the filter restarts. The bounds are wide: a number outside is certainly wrong, but a
+//! number inside may be wrong, too.
 
 use super::InvalidState;
 
-/// A closed range, with a description that includes the unit.
+/// A closed range. `allowed` describes it with the unit.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Bounds {
     pub low: f64,
     pub high: f64,
-    /// The range in words, with the unit.
     pub allowed: &'static str,
 }
 
@@ -27,38 +26,29 @@ impl Bounds {
     }
 
     /// Rejects a value of a stored state outside the range.
-    ///
-    /// # Errors
-    /// The value and the allowed range.
     pub fn check(&self, what: &'static str, found: f64) -> Result<(), InvalidState> {
         InvalidState::unless(self.has(found), what, found, self.allowed)
     }
 
-    /// Applies [`Self::check`] to every value.
-    ///
-    /// # Errors
-    /// The first value outside the range.
+    /// Applies [`Self::check`] to every value and returns the first error.
     pub fn check_all(&self, what: &'static str, all: impl IntoIterator<Item = f64>) -> Result<(), InvalidState> {
         all.into_iter().try_for_each(|found| self.check(what, found))
     }
 }
 
-/// Capacity of a cell in the configuration (Ah): from a watch cell to a hundred times the largest cell on the market.
+/// Configured capacity of a cell (Ah): from a watch cell to a hundred times the largest cell on the market.
 pub const CONFIGURED_CAPACITY_AH: Bounds = Bounds::new(1e-3, 1e5, "0.001 to 1e5 Ah");
 
-/// Estimated capacity of a cell (Ah): from a thousandth of the smallest to ten thousand times the largest
-/// [configured capacity](CONFIGURED_CAPACITY_AH).
+/// Estimated capacity of a cell (Ah), far beyond [`CONFIGURED_CAPACITY_AH`] in both directions.
 pub const CAPACITY_AH: Bounds = Bounds::new(1e-6, 1e9, "1e-6 to 1e9 Ah");
 
-/// SOC in a running filter. A model's curve is extrapolated to these bounds, beyond empty and full. A filter restarts
-/// if its SOC is outside these bounds.
+/// SOC in a running filter. A model's curve is extrapolated up to these bounds.
 pub const FILTER_SOC: Bounds = Bounds::new(-0.5, 1.5, "-0.5 to 1.5");
 
 /// SOC of a trusted estimate. The bounds allow for the error at the ends of a curve.
 pub const TRUSTED_SOC: Bounds = Bounds::new(-0.1, 1.1, "-0.1 to 1.1");
 
-/// SOC in a stored state. The range is wider than [`FILTER_SOC`], because earlier versions allowed a wider range in a
-/// filter.
+/// SOC in a stored state. Earlier versions allowed a wider range than [`FILTER_SOC`].
 pub const STORED_SOC: Bounds = Bounds::new(-10.0, 10.0, "-10 to 10");
 
 /// Natural logarithm of a cell's resistance relative to new: a factor of about 1,000 in both directions.
@@ -67,8 +57,8 @@ pub const LOG_RESISTANCE: Bounds = Bounds::new(-7.0, 7.0, "-7 to 7");
 /// Like [`LOG_RESISTANCE`], for a trusted estimate: a factor of 33.
 pub const TRUSTED_LOG_RESISTANCE: Bounds = Bounds::new(-3.5, 3.5, "-3.5 to 3.5");
 
-/// Learned capacity that is trusted, relative to the capacity of the cell model or of the configuration. A worn cell
-/// keeps more than a twentieth of its capacity, and no cell has three times the capacity on its label.
+/// Trusted learned capacity, relative to the capacity of the cell model or of the configuration. A worn cell keeps more
+/// than a twentieth of its capacity, and no cell has three times the capacity on its label.
 pub const TRUSTED_CAPACITY: Bounds = Bounds::new(0.05, 3.0, "0.05 to 3 times the cell's capacity");
 
 /// Configured initial capacity, relative to the cell model's capacity.
@@ -98,19 +88,19 @@ pub const CHARGE_AS: Bounds = Bounds::new(-1e16, 1e16, "-1e16 to 1e16 As");
 /// A point in time, ns. The difference of two points fits the clock's range.
 pub const STAMP_NS: Bounds = Bounds::new(-4.6e18, 4.6e18, "within 145 years of the clock's origin");
 
-/// Any number without a more specific bound: its square and its cube do not overflow.
+/// Any number without a more specific bound. Its square and its cube do not overflow.
 pub const NUMBER: Bounds = Bounds::new(-1e20, 1e20, "at most 1e20 in size");
 
-/// Variance of any quantity, in the square of the quantity's unit. The caller can divide by the square of the variance.
+/// Variance of any quantity. The caller can divide by its square.
 pub const VARIANCE: Bounds = Bounds::new(1e-150, 1e20, "1e-150 to 1e20");
 
-/// Configured standard deviation or noise density of any quantity, in the quantity's unit.
+/// Configured standard deviation or noise density of any quantity.
 pub const DEVIATION: Bounds = Bounds::new(0.0, 1e3, "0 to 1000");
 
 /// Standard deviation of a voltage sensor's noise (V). No converter is better than the lower bound.
 pub const VOLTAGE_NOISE_V: Bounds = Bounds::new(1e-6, 10.0, "1e-6 to 10 V");
 
-/// Spread of the sigma points. Below the lower bound, the differences between the points are lost in rounding.
+/// Spread of the sigma points. With a smaller spread, the differences between the points are lost in rounding.
 pub const SIGMA_POINT_SPREAD: Bounds = Bounds::new(1e-3, 1.0, "0.001 to 1");
 
 #[cfg(test)]

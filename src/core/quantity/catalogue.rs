@@ -1,9 +1,8 @@
 //! Catalogue of every published number of the pack and its cells.
 //!
-//! [`TABLE`] has a row per quantity, with its JSON keys, its unit and its name in metrics. For the pack and for a cell,
-//! the row has a description and the names in MQTT and VSS. The status document, metrics, MQTT entities, VSS signals,
-//! exports and the manual's page iterate over the table. The [`Monitor`](crate::monitor::Monitor) sets the values. To
-//! publish another number, add a row here and set its value in the monitor.
+//! [`TABLE`] has a row per quantity, with its JSON keys, its unit and its names in metrics, MQTT and VSS. The status
+//! document, metrics, MQTT entities, VSS signals, exports and the manual iterate over the table. To publish another
+//! number, add a row to the table and set its value in the [`Monitor`](crate::monitor::Monitor).
 
 mod table;
 
@@ -19,7 +18,7 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer};
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Estimate {
     pub mean: f64,
-    /// Standard deviation; `None` = the value has no standard deviation.
+    /// `None` = the value has no standard deviation.
     pub std: Option<f64>,
 }
 
@@ -58,17 +57,17 @@ pub enum Part {
     Std,
 }
 
-/// Unit of a quantity inside the program. Each output converts the unit with a `match`.
+/// Unit of a quantity inside the program.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Unit {
-    /// State of charge or state of health: fraction of a full battery or of a new battery.
+    /// SOC or SOH, as a fraction.
     Level,
     /// Any other fraction, 0 to 1.
     Fraction,
-    /// Multiple of the value when new.
+    /// Relative to new.
     Ratio,
     Volts,
-    /// Amperes, positive = discharge.
+    /// Positive = discharge.
     Amperes,
     Celsius,
     AmpereHours,
@@ -102,23 +101,22 @@ impl Unit {
     }
 }
 
-/// Path of a VSS signal. The path of the standard deviation is derived from this path.
+/// Path of a VSS signal, from which the path of the standard deviation is derived.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum VssPath {
-    /// A signal of standard VSS, below its battery branch.
+    /// Standard VSS, below its battery branch.
     Standard(&'static str),
-    /// A signal of the overlay, below the configured branch.
+    /// The overlay, below the configured branch.
     Overlay(&'static str),
 }
 
-/// Description and names of a quantity for one owner: the pack, or each cell.
+/// Description and names of a quantity of the pack, or of each cell.
 #[derive(Debug, Clone, Copy)]
 pub struct Presentation {
-    /// Description for tables and documentation.
     pub about: &'static str,
-    /// Key in MQTT; `None` = not published there.
+    /// `None` = not published in MQTT.
     pub mqtt_key: Option<&'static str>,
-    /// Name of the quantity's entity in Home Assistant; empty for a cell, which has no entity.
+    /// Name of the entity in Home Assistant; empty for a cell.
     pub mqtt_name: &'static str,
     pub vss: VssPath,
 }
@@ -129,19 +127,19 @@ pub struct QuantityRow {
     pub quantity: Quantity,
     /// JSON key and column name of the mean.
     pub key: &'static str,
-    /// JSON key and column name of the standard deviation; `None` = the quantity has none.
+    /// JSON key and column name of the standard deviation.
     pub std_key: Option<&'static str>,
     pub unit: Unit,
-    /// Name of the metric, without prefix and unit.
+    /// Without prefix and unit.
     pub metric: &'static str,
-    /// Presentation as a value of the pack; `None` = only cells have it.
+    /// `None` = only cells have this quantity.
     pub pack: Option<Presentation>,
-    /// Presentation as a value of a cell; `None` = only the pack has it.
+    /// `None` = only the pack has this quantity.
     pub cell: Option<Presentation>,
 }
 
 impl QuantityRow {
-    /// The key of the mean and, if the quantity has one, of the standard deviation.
+    /// The key of the mean and, if it exists, the key of the standard deviation.
     pub fn parts(&self) -> impl Iterator<Item = (Part, &'static str)> + use<> {
         [(Part::Mean, self.key)].into_iter().chain(self.std_key.map(|key| (Part::Std, key)))
     }
@@ -172,7 +170,7 @@ impl QuantityRow {
     }
 }
 
-/// A published number. The unit and the meaning are in the quantity's row of [`TABLE`].
+/// A published number. [`TABLE`] describes it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[expect(missing_docs, reason = "the row describes it")]
 pub enum Quantity {
@@ -222,7 +220,7 @@ impl Quantity {
     }
 }
 
-/// The values of the pack or of one cell. `None` = unknown.
+/// The values of the pack or of a cell; `None` = unknown.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Values<const IS_PACK: bool>([Option<Estimate>; TABLE.len()]);
 
@@ -236,7 +234,7 @@ impl<const IS_PACK: bool> Default for Values<IS_PACK> {
 }
 
 impl<const IS_PACK: bool> Values<IS_PACK> {
-    /// The rows that apply to this owner (the pack or a cell), each with its presentation for this owner.
+    /// The rows that apply to the pack or to a cell.
     pub fn rows() -> impl Iterator<Item = (&'static QuantityRow, &'static Presentation)> {
         TABLE.iter().filter_map(|row| Some((row, if IS_PACK { row.pack.as_ref() } else { row.cell.as_ref() }?)))
     }
@@ -263,7 +261,7 @@ impl<const IS_PACK: bool> Values<IS_PACK> {
         self.0[quantity as usize] = value.map(Into::into).and_then(Estimate::known);
     }
 
-    /// Returns the values after replacing the value of `quantity`.
+    /// The values with a new value for `quantity`.
     #[must_use]
     pub fn with(mut self, quantity: Quantity, value: Option<impl Into<Estimate>>) -> Self {
         self.set(quantity, value);
@@ -296,7 +294,7 @@ pub const RECORDED_OF_PACK: [Quantity; 5] = [
     Quantity::ChargePower10s,
 ];
 
-/// Values of some quantities. `None` = unknown.
+/// Values of some quantities; `None` = unknown.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Selection<const IS_PACK: bool, const N: usize>([Option<Estimate>; N]);
 
@@ -312,19 +310,18 @@ impl<const IS_PACK: bool, const N: usize> Default for Selection<IS_PACK, N> {
 }
 
 impl<const IS_PACK: bool, const N: usize> Selection<IS_PACK, N> {
-    /// The selected quantities.
     const fn quantities() -> &'static [Quantity] {
         if IS_PACK { &RECORDED_OF_PACK } else { &RECORDED }
     }
 
-    /// Selects from all values of an owner.
+    /// Selects from all values of the pack or of a cell.
     pub fn of(values: &Values<IS_PACK>) -> Self {
         let mut selected = Self::default();
         selected.0.iter_mut().zip(Self::quantities()).for_each(|(place, quantity)| *place = values.get(*quantity));
         selected
     }
 
-    /// The value of a quantity; `None` if it is unknown or not selected.
+    /// The value of a quantity; `None` = unknown or not selected.
     pub fn get(&self, quantity: Quantity) -> Option<Estimate> {
         Self::quantities().iter().zip(self.0).find(|(selected, _)| **selected == quantity)?.1
     }
@@ -337,7 +334,7 @@ impl<const IS_PACK: bool, const N: usize> Selection<IS_PACK, N> {
         self.get(quantity).and_then(|estimate| Some((estimate.mean, estimate.std?)))
     }
 
-    /// Returns the values after replacing the value of `quantity`. Ignores quantities that are not selected.
+    /// The values with a new value for `quantity`. Ignores quantities that are not selected.
     #[must_use]
     pub fn with(mut self, quantity: Quantity, value: Option<impl Into<Estimate>>) -> Self {
         let value = value.map(Into::into).and_then(Estimate::known);
@@ -347,7 +344,7 @@ impl<const IS_PACK: bool, const N: usize> Selection<IS_PACK, N> {
         self
     }
 
-    /// The keys of the values in order, each mean before its standard deviation.
+    /// The keys in order, each mean before its standard deviation.
     pub fn keys() -> impl Iterator<Item = &'static str> {
         Self::quantities().iter().flat_map(|quantity| quantity.row().parts().map(|(_, key)| key))
     }
@@ -365,7 +362,7 @@ impl<'de, const IS_PACK: bool, const N: usize> Deserialize<'de> for Selection<IS
     }
 }
 
-/// Writes the values as a map by key.
+/// Writes a map by key.
 fn write<S: Serializer>(
     serializer: S,
     values: impl Iterator<Item = (&'static QuantityRow, Option<Estimate>)>,
@@ -379,7 +376,7 @@ fn write<S: Serializer>(
     map.end()
 }
 
-/// Reads the keys of the catalogue and ignores all other keys.
+/// Ignores keys that are not in the catalogue.
 struct ValuesVisitor<const IS_PACK: bool>;
 
 impl<'de, const IS_PACK: bool> Visitor<'de> for ValuesVisitor<IS_PACK> {

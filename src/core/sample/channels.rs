@@ -1,6 +1,4 @@
-//! Lists the channels in use, and selects the configured [`Limits`] of each channel. The stuck check reports a reading
-//! that stays the same for too long although it should change; this module also selects the clock that measures how
-//! long.
+//! Lists the channels in use, and selects the configured [`Limits`] of each channel and the clock of its stuck check.
 
 use super::charge::ChargeTotals;
 use super::config::{Limits, SampleConfig, VoltageSource};
@@ -38,14 +36,14 @@ pub(super) fn channels(config: &SampleConfig, sensors: usize) -> Vec<Channel> {
     channels
 }
 
-/// Clock of the stuck check: cumulative time in which the signal should have changed (s). For a voltage, only the time
-/// of discharge counts, because a charger may hold the voltage constant. Temperature and current should change whenever
-/// current flows.
+/// Clock of the stuck check: cumulative time (s) in which the signal should have changed. For a voltage, only discharge
+/// counts, because a charger may hold the voltage constant. Temperature and current should change whenever current
+/// flows.
 pub(super) fn should_move_s(channel: Channel, totals: &ChargeTotals) -> f64 {
     match channel {
         Channel::Current | Channel::Temperature(_) => totals.flowing_s,
         Channel::PackVoltage | Channel::CellVoltage(_) => totals.discharging_s,
-        // These channels have no stuck check.
+        // No stuck check.
         Channel::ReportedSoc
         | Channel::ReportedSoh
         | Channel::SupplyVoltage

@@ -1,55 +1,54 @@
 //! Counts the charge through the pack and the time without a current measurement.
 //!
 //! In: good current readings (A), positive = discharge. Out: cumulative charge (As) and cumulative unmeasured time (s);
-//! only their differences are meaningful. An interval between two current readings counts as follows:
-//! * at most the current's `max_age_s`: the charge is the mean of the two readings times the elapsed time (trapezoid);
-//! * longer than `max_age_s`, the maximum age of a usable value: the first reading is held for `max_age_s`. The rest of
-//!   the interval is unmeasured, regardless of the cause (bad readings, lost frames, sleep, a restart). If the interval
-//!   is at most [`SHORT_GAP`] times as long as `max_age_s`, the trapezoid replaces the held charge, because zero would
-//!   be too little under a steady load. The time still counts as unmeasured, so the SOC becomes more uncertain.
+//! only their differences are meaningful. `max_age_s` is the maximum age of a usable reading. An interval between two
+//! current readings counts as follows:
+//! * At most `max_age_s`: the charge is the mean of the two readings times the elapsed time (trapezoid).
+//! * Longer than `max_age_s`: the first reading is held for `max_age_s`. The rest of the interval is unmeasured,
+//!   regardless of the cause (bad readings, lost frames, sleep, a restart).
+//! * Longer than `max_age_s`, but at most [`SHORT_GAP`] times as long: the trapezoid replaces the held charge, because
+//!   a steady load is likely. The rest still counts as unmeasured, so the SOC becomes more uncertain.
 //!
-//! After the latest reading, the current is also held for `max_age_s`. If the next reading arrives within this time,
-//! the trapezoid replaces the held value. While a valid reading says that the contactors are open, the current counts
-//! as zero, regardless of the current sensor. Unmeasured time never decreases and never grows faster than time. Before
-//! the first current reading, all time is unmeasured.
+//! After the latest reading, the current is also held for `max_age_s`. While a valid reading says that the contactors
+//! are open, the current counts as zero, regardless of the current sensor. Unmeasured time never decreases and never
+//! grows faster than time. Before the first current reading, all time is unmeasured.
 
 use serde::{Deserialize, Serialize};
 
 use crate::quantity::bounds;
 use crate::quantity::{InvalidState, Timestamp};
 
-/// Longest interval, in multiples of `max_age_s`, in which the mean of both readings is the most likely current.
+/// In intervals up to this multiple of `max_age_s`, the mean of both readings is the most likely current.
 const SHORT_GAP: f64 = 4.0;
 
 /// Cumulative charge and unmeasured time at one moment.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct ChargeTotals {
-    /// Charge taken out of the pack (As).
+    /// Taken out of the pack.
     pub charge_as: f64,
-    /// Time in which the reading was not exactly zero (s). The sensor's offset contributes to the charge of this time.
+    /// Time in which the reading was not exactly zero and therefore included the sensor's offset.
     pub offset_s: f64,
-    /// Time without a usable current (s).
+    /// Time without a usable current.
     pub unmeasured_s: f64,
-    /// Time in which current flowed in either direction (s).
+    /// In either direction.
     pub(super) flowing_s: f64,
-    /// Time in which the pack was discharged (s).
     pub(super) discharging_s: f64,
 }
 
-/// Counter of charge and time: totals up to `counted_to`, and the current after it.
+/// Totals up to `counted_to`, and the current afterwards.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(super) struct ChargeCounter {
     totals: ChargeTotals,
-    /// Time up to which the totals are final; `None` = no input yet.
+    /// `None` = no input yet.
     counted_to: Option<Timestamp>,
-    /// The current after `counted_to` (A); `None` = unmeasured.
+    /// `None` = unmeasured.
     current_a: Option<f64>,
-    /// The contactors are open until this time; `None` = closed or unknown.
+    /// `None` = the contactors are closed, or their state is unknown.
     open_until: Option<Timestamp>,
 }
 
 impl ChargeCounter {
-    /// Starts the clock at the first input of any kind. Time without a current after this input is unmeasured.
+    /// Starts the clock at the first input of any kind.
     pub(super) fn begin(&mut self, time: Timestamp) {
         self.counted_to.get_or_insert(time);
     }
@@ -73,7 +72,7 @@ impl ChargeCounter {
         self.current_a = Some(current_a);
     }
 
-    /// Totals at `time`; the latest reading is held for at most `max_age_s`.
+    /// Totals at `time`. Holds the latest reading for at most `max_age_s`.
     #[inline]
     pub(super) fn totals_at(&self, time: Timestamp, max_age_s: f64) -> ChargeTotals {
         let dt_s = self.passed_s(time);
@@ -98,13 +97,13 @@ impl ChargeCounter {
         self.open_until.is_some_and(|until| now <= until)
     }
 
-    /// Handles open contactors: no current flows from `time` to `until`, unless the contactors close earlier.
+    /// No current flows from `time` to `until`, unless the contactors close earlier.
     pub(super) fn open(&mut self, time: Timestamp, until: Timestamp, max_age_s: f64) {
         self.hold(time, Some(0.0), max_age_s);
         self.open_until = Some(until);
     }
 
-    /// Handles closed contactors. If the contactors were open, the current is `measured_a` from `time` on.
+    /// If the contactors were open, the current is `measured_a` from `time` on.
     pub(super) fn close(&mut self, time: Timestamp, measured_a: Option<f64>, max_age_s: f64) {
         if self.open_until.is_some() {
             self.hold(time, measured_a, max_age_s);
@@ -112,14 +111,14 @@ impl ChargeCounter {
         }
     }
 
-    /// Makes the totals final up to `time`, and holds `current_a` after it.
+    /// Makes the totals final up to `time`, and then holds `current_a`.
     fn hold(&mut self, time: Timestamp, current_a: Option<f64>, max_age_s: f64) {
         self.totals = self.totals_at(time, max_age_s);
         self.counted_to = Some(self.counted_to.map_or(time, |last| last.max(time)));
         self.current_a = current_a;
     }
 
-    /// How long the latest current is held (s): `max_age_s`, or longer while the contactors are open.
+    /// `max_age_s`, or longer while the contactors are open.
     #[inline]
     fn hold_s(&self, max_age_s: f64) -> f64 {
         match (self.open_until, self.counted_to) {
@@ -128,7 +127,6 @@ impl ChargeCounter {
         }
     }
 
-    /// Forgets the state of contactors that were removed from the configuration.
     pub(super) fn forget_contactors(&mut self) {
         self.open_until = None;
     }
@@ -139,7 +137,7 @@ impl ChargeCounter {
         }
     }
 
-    /// Checks a stored counter; the error is the first impossible number.
+    /// Returns the first impossible number.
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         let ChargeTotals { charge_as, offset_s, unmeasured_s, flowing_s, discharging_s } = self.totals;
         bounds::CHARGE_AS.check("the counted charge", charge_as)?;
@@ -152,7 +150,7 @@ impl ChargeCounter {
     }
 }
 
-/// 1 if the reading includes the sensor's offset, else 0. A reading of exactly zero does not include the offset.
+/// 1 if the reading includes the sensor's offset, else 0. Only a reading of exactly zero does not include the offset.
 fn offset_part(current_a: f64) -> f64 {
     if current_a == 0.0 { 0.0 } else { 1.0 }
 }
@@ -192,7 +190,7 @@ mod tests {
 
     #[test]
     fn ramp_integrates_exactly_with_uneven_steps() {
-        // i = t: the charge is t^2 / 2 for any step size.
+        // The current equals the time, so the charge is t^2 / 2.
         let counter = counter(&[(0.0, 0.0), (0.5, 0.5), (2.5, 2.5), (2.75, 2.75), (4.0, 4.0)]);
         assert_eq!(charge_and_gap(&counter, 4.0), (8.0, 0.0));
     }

@@ -4,40 +4,32 @@ use serde::{Deserialize, Serialize};
 
 use crate::quantity::Fault;
 
-/// Readings by outcome since the first start; part of the stored state.
+/// Readings by outcome since the first start. Rejected readings are counted by [`Fault`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct ReadingCounts {
-    /// Readings that were used.
     pub accepted: u64,
     /// Readings of channels that the configuration does not use.
     pub unused: u64,
-    /// Steps to a new level that were rejected at first and accepted once they persisted.
+    /// Steps to a new level that were accepted because they persisted.
     pub levels_believed: u64,
-    /// Readings whose frame was too short.
     pub short_frame: u64,
-    /// Readings whose frame failed its end-to-end check.
     pub end_to_end: u64,
-    /// Readings that the sender marked as not available.
     pub not_available: u64,
-    /// Readings that were NaN or infinite.
     pub not_finite: u64,
-    /// Readings outside their range.
     pub out_of_range: u64,
-    /// Readings that changed too fast.
     pub rate_too_high: u64,
-    /// Readings that did not change although they should have.
     pub stuck: u64,
     /// How often a signal became too old.
     pub stale: u64,
 }
 
 impl ReadingCounts {
-    /// Number of readings that were not used although their sender stated a value.
+    /// Readings that were not used although their sender stated a value.
     pub fn refused(&self) -> u64 {
         self.refusals().iter().map(|(count, _)| count).sum()
     }
 
-    /// The refused readings by reason, for example "12 out of range, 3 stuck".
+    /// Refused readings by reason, for example "12 out of range, 3 stuck".
     pub fn refused_in_words(&self) -> String {
         let refusals = self.refusals().into_iter().filter(|(count, _)| *count > 0);
         let words: Vec<_> = refusals.map(|(count, reason)| format!("{count} {reason}")).collect();

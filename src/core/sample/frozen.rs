@@ -5,58 +5,56 @@
 //!
 //! A constant reading alone proves nothing. A parked pack, a charger and a laboratory hold a current for hours, and a
 //! coarse sensor then shows one value. In these cases, the voltages rest or drift in one direction. A changing load
-//! moves the voltages back and forth. The check takes the median of the cells' voltages in each *round* (one voltage
-//! per cell). The median must move in one direction and turn back within [`MAX_TURN_S`]. Both movements must be at
-//! least as large as the *step*, which exceeds the noise of the median. The sensor counts as frozen if at least
-//! [`MIN_READINGS`] readings were equal and the reading has still not changed when [`MIN_FROZEN_S`] have passed since
-//! the turn. The delay allows for a reading that arrives later than the voltages.
+//! moves the voltages back and forth.
 //!
-//! Limits: the check does not detect a frozen sensor if the voltages do not turn back, or if they move by less than the
-//! step. The check does not detect a faulty sensor whose last digits still change. In that case, the voltages
-//! contradict the estimate.
+//! The check takes the median of the cells' voltages in each *round* (one voltage per cell). The median must move in
+//! one direction and turn back within [`MAX_TURN_S`]. Both movements must be at least as large as the *step*, which
+//! exceeds the noise of the median. The sensor counts as frozen if at least [`MIN_READINGS`] readings were equal and
+//! the reading stays unchanged for [`MIN_FROZEN_S`] after the turn.
+//!
+//! A frozen sensor is not detected if the voltages do not turn back, or if they move by less than the step. A faulty
+//! sensor whose last digits still change is not detected either, but the voltages then contradict the estimate.
 
 use serde::{Deserialize, Serialize};
 
 use crate::quantity::{InvalidState, Timestamp, bounds};
 
-/// Minimum number of equal current readings.
 const MIN_READINGS: u32 = 20;
-/// How long the reading must remain unchanged after the voltages turned back (s). A current reading follows the
-/// voltages within this time.
+/// How long the reading must remain unchanged after the turn (s). A healthy sensor's reading follows the voltages
+/// within this time.
 const MIN_FROZEN_S: f64 = 5.0;
-/// Longest time between an extreme voltage and the return from this extreme (s). The voltages of cells that rest, cool
-/// or balance turn more slowly.
+/// Longest time from an extreme voltage to the turn (s). The voltages of cells that rest, cool or balance turn more
+/// slowly.
 const MAX_TURN_S: f64 = 60.0;
-/// Step that exceeds a voltage's noise, as a multiple of the configured standard deviation.
+/// Step in configured standard deviations of a voltage's noise.
 const STEP_SIGMA: f64 = 5.0;
-/// Step that exceeds a voltage's noise, as a multiple of the usual change from round to round (the median of the latest
-/// changes). This step applies if the real noise exceeds the configured noise. The multiple corresponds to 8 standard
-/// deviations, so that two consecutive readings do not exceed the step by chance within a day.
+/// Step as a multiple of the median change from round to round, for noise beyond the configured noise. The multiple
+/// corresponds to 8 standard deviations, so that two consecutive readings do not exceed the step by chance within a
+/// day.
 const STEP_MOVES: f64 = 8.4;
-/// Maximum and minimum number of changes from which the usual change is calculated.
+/// Maximum and minimum number of changes from which the median change is calculated.
 const MAX_MOVES: usize = 32;
 const MIN_MOVES: usize = 8;
-/// Smallest step (V). A smaller movement may come from a charger's ripple, or from a load that changes by less than the
+/// Smallest step (V). Smaller movements may come from a charger's ripple, or from a load that changes by less than the
 /// resolution of a coarse current sensor.
 const MIN_STEP_V: f64 = 0.02;
-/// Maximum number of cells in the median. The first cells of the pack are used; they are enough to distinguish a glitch
-/// from a load.
+/// Maximum number of cells in the median. The first cells of the pack are enough to distinguish a glitch from a load.
 const MAX_MEDIAN: usize = 15;
 /// Longest time between two current readings (s). After a longer pause, the check restarts, unless the sensor already
 /// counts as frozen.
 const MAX_PAUSE_S: f64 = 5.0;
 
-/// Detects turning points of a voltage.
+/// Turning points of a voltage.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Reversals {
-    /// Lowest and highest voltage since the last turning point (V); `None` = no voltage yet.
+    /// Lowest and highest voltage since the last turning point.
     range_v: Option<(f64, f64)>,
     /// Whether the voltage has risen since the last turning point; `None` = no turning point yet.
     is_rising: Option<bool>,
-    /// Time of the extreme voltage in the present direction.
+    /// When the voltage had its extreme.
     extreme_at: Timestamp,
-    /// Whether one reading shows a turn that the next reading must confirm.
+    /// Whether the next reading must confirm a turn.
     is_unconfirmed: bool,
     /// Whether the voltage has turned back within [`MAX_TURN_S`].
     has_turned: bool,
@@ -97,27 +95,25 @@ impl Reversals {
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct FrozenCheck {
-    /// The unchanged reading of the current, the time of its latest occurrence, and the number of occurrences.
+    /// The unchanged reading, the time of its latest occurrence, and the number of occurrences.
     current_a: Option<f64>,
     latest: Timestamp,
     readings: u32,
     reversals: Reversals,
-    /// Time of the first current reading after the voltages turned back.
+    /// Time of the first current reading after the turn.
     turned_at: Option<Timestamp>,
-    /// Voltages of the present round (V) at most [`MAX_MEDIAN`]. The first cell starts a round.
+    /// Voltages of the present round, at most [`MAX_MEDIAN`]. The first cell starts a round.
     round_v: Vec<f64>,
     /// Whether the present round started before the reading of the current changed.
     is_mixed: bool,
-    /// Median of the previous round (V).
+    /// Median of the previous round.
     median_v: f64,
-    /// Latest absolute changes of the median (V) at most [`MAX_MOVES`]. These changes are kept when the reading of the
-    /// current changes.
+    /// Latest absolute changes of the median, at most [`MAX_MOVES`]. Kept when the reading of the current changes.
     moves_v: Vec<f64>,
     is_frozen: bool,
 }
 
-/// Step that exceeds the noise (V): [`STEP_SIGMA`] times the standard deviation `noise_v` (V), but at least
-/// [`MIN_STEP_V`].
+/// Step (V) that exceeds noise with the standard deviation `noise_v` (V).
 pub(super) fn step_v(noise_v: f64) -> f64 {
     (STEP_SIGMA * noise_v).max(MIN_STEP_V)
 }
@@ -128,7 +124,7 @@ impl FrozenCheck {
         self.is_frozen
     }
 
-    /// Handles a current reading; returns whether the sensor is frozen.
+    /// Handles a current reading. Returns whether the sensor is frozen.
     pub(super) fn handle_current(&mut self, now: Timestamp, current_a: f64) -> bool {
         let is_paused = now.since(self.latest) > MAX_PAUSE_S;
         if self.current_a != Some(current_a) || (is_paused && !self.is_frozen) {
@@ -150,7 +146,7 @@ impl FrozenCheck {
         self.is_frozen
     }
 
-    /// Handles the voltage of a cell; the first cell starts a round.
+    /// Handles a cell's voltage. The first cell starts a round.
     #[inline]
     pub(super) fn handle_voltage(&mut self, now: Timestamp, cell: usize, voltage_v: f64, step_v: f64) {
         if cell >= MAX_MEDIAN {
@@ -167,7 +163,7 @@ impl FrozenCheck {
     fn end_round(&mut self, now: Timestamp, step_v: f64) {
         self.round_v.sort_unstable_by(f64::total_cmp);
         let cells = self.round_v.len();
-        // Of the two middle cells, take the cell that changed less, because a load moves both cells.
+        // Take the middle cell that changed less, because a load moves both middle cells.
         let (low, high) = (self.round_v[(cells - 1) / 2], self.round_v[cells / 2]);
         let is_low_nearer = (low - self.median_v).abs() <= (high - self.median_v).abs();
         let median = if is_low_nearer { low } else { high };
@@ -190,7 +186,6 @@ impl FrozenCheck {
         *moves_v.select_nth_unstable_by(self.moves_v.len() / 2, f64::total_cmp).1
     }
 
-    /// Forgets everything. Called after a gap of unknown length.
     pub(super) fn restart(&mut self) {
         *self = Self::default();
     }
@@ -201,7 +196,7 @@ impl FrozenCheck {
         }
     }
 
-    /// Checks a stored state; the error is the first impossible number.
+    /// Returns the first impossible number.
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         let (low, high) = self.reversals.range_v.unwrap_or_default();
         bounds::VOLTAGE_V.check("the median voltage of the frozen-current check", self.median_v)?;
@@ -230,8 +225,7 @@ impl FrozenCheck {
 mod tests {
     use super::*;
 
-    /// Simulates ten readings a second of a current and of three cells for `seconds`; returns when the current was
-    /// found frozen (s).
+    /// Simulates ten readings a second of a current and of three cells. Returns when the current was found frozen (s).
     fn found_s(seconds: u32, current: impl Fn(f64) -> f64, voltage: impl Fn(f64) -> f64) -> Option<f64> {
         let mut check = FrozenCheck::default();
         (0..10 * seconds).map(|k| f64::from(k) / 10.0).find(|&time_s| {
@@ -243,7 +237,7 @@ mod tests {
         })
     }
 
-    /// A drive whose load changes every few seconds.
+    /// A load that changes every few seconds.
     fn load_a(time_s: f64) -> f64 {
         40.0 + 60.0 * libm::sin(0.7 * time_s) * libm::sin(0.11 * time_s)
     }
@@ -283,8 +277,7 @@ mod tests {
     fn measured_load_and_glitches_are_not_frozen() {
         let voltage = |time_s: f64| 3.7 - 1.5e-3 * load_a(time_s);
         assert_eq!(found_s(600, load_a, voltage), None);
-        // A coarse sensor may have five times the configured noise. Here, the noise is pseudorandom, uniform and
-        // derived from the time.
+        // A coarse sensor may have five times the configured noise. This noise is pseudorandom and uniform.
         let noise = |time_s: f64| {
             let bits = ((10.0 * time_s) as u64).wrapping_add(1).wrapping_mul(0x9E37_79B9_7F4A_7C15);
             let bits = (bits ^ (bits >> 29)).wrapping_mul(0xBF58_476D_1CE4_E5B9);

@@ -4,7 +4,6 @@
 //! reading, and a [`SignalChange`] when a signal turns bad or good. The value of a bad reading never enters a sample.
 //! * [`signal`] checks one signal: range, rate, stuck, stale;
 //! * [`charge`] counts charge and the time without a current measurement;
-//! * [`cell_sample`] defines the input of a cell's estimator;
 //! * [`sampler`] holds one signal per channel and combines them into samples.
 
 pub mod cell_sample;

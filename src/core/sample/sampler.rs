@@ -1,12 +1,11 @@
-//! Combines the signals of all configured channels and the charge counter into samples.
+//! Combines the signals of all channels in use and the charge counter into samples.
 //!
 //! In: readings with their time (V, A, degrees C). Out: a [`CellSample`] per good voltage. A sample contains the
-//! current and temperature that are fresh at the time of the voltage, and the charge and unmeasured time up to then. A
-//! bad voltage gives no sample. Readings of channels that are not used are counted ([`Sampler::reading_counts`]).
+//! current and temperature that are fresh at the time of the voltage, and the charge and unmeasured time up to this
+//! time.
 //!
-//! The sampler holds one `Signal` per channel, allocated at the start. After the first readings have filled the
-//! buffers, handling a reading allocates nothing. The signals are an array of structs, because a reading touches all
-//! fields of one signal.
+//! The signals are an array of structs, because a reading touches all fields of one signal. Once the buffers are
+//! filled, handling a reading allocates nothing.
 
 mod inputs;
 
@@ -23,16 +22,14 @@ pub use inputs::SensorRange;
 
 use crate::quantity::{CellIndex, Channel, Fault, InvalidState, Reading, SensorIndex, Timestamp};
 
-/// Smallest current that counts as flowing, as a fraction of the largest plausible current. A sensor's noise and offset
-/// at rest are below this current. Any load under which a voltage or temperature must change is above this current.
+/// Smallest current that counts as flowing, as a fraction of the largest plausible current. It is above a sensor's
+/// noise and offset, and below any load under which a voltage or temperature must change.
 pub const FLOW_SHARE: f64 = 0.01;
 
-/// Reports that a signal turned bad (`Err` with the fault) or good again (`Ok` with the number of preceding bad
-/// readings).
+/// Reports that a signal turned bad (with the fault) or good again (with the number of preceding bad readings).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SignalChange {
     pub channel: Channel,
-    /// New state of the signal.
     pub state: Result<u64, Fault>,
 }
 
@@ -51,27 +48,24 @@ pub struct SamplerState {
 }
 
 impl SamplerState {
-    /// Checks the numbers of a stored state.
-    ///
-    /// # Errors
-    /// The first impossible number.
+    /// Checks a stored state and returns the first impossible number.
     pub fn check(&self) -> Result<(), InvalidState> {
         self.charge.check()?;
         self.frozen.check()?;
         self.signals.iter().try_for_each(Signal::check)
     }
 
-    /// Configured number of parallel strings and of cells in series.
+    /// Number of parallel strings and of cells in series.
     pub fn wiring(&self) -> (u16, u16) {
         (self.strings, self.series)
     }
 
-    /// Pack charge up to `time` (As); the latest current reading is held for at most `max_age_s`.
+    /// Pack charge up to `time` (As). Holds the latest current reading for at most `max_age_s`.
     pub fn charge_as(&self, time: Timestamp, max_age_s: f64) -> f64 {
         self.charge.totals_at(time, max_age_s).charge_as
     }
 
-    /// Moves every time stamp by `by_nanos`, onto another clock.
+    /// Shifts every time stamp by `by_nanos` to another clock.
     pub fn rebase(&mut self, by_nanos: i64) {
         self.signals.iter_mut().for_each(|signal| signal.rebase(by_nanos));
         self.charge.rebase(by_nanos);
@@ -85,25 +79,22 @@ impl SamplerState {
 #[derive(Debug, Clone)]
 pub struct Sampler {
     config: SampleConfig,
-    /// Channels in the order of their signals: current, temperatures, voltages, values reported by the pack,
-    /// contactors.
+    /// In the order of the signals: current, temperatures, voltages, values reported by the pack, contactors.
     channels: Vec<Channel>,
-    /// Number of temperature sensors in use.
     sensors: usize,
-    /// Number of voltage channels.
     voltages: usize,
     flow_a: f64,
     /// Voltage step that is larger than the noise (V).
     step_v: f64,
     state: SamplerState,
-    /// No signal becomes stale before this time; `None` = to be computed.
+    /// Earliest time at which a signal becomes stale; `None` = not computed.
     next_stale: Option<Timestamp>,
     bad_signals: usize,
     shared: SharedInputs,
 }
 
-/// Inputs shared by readings with the same time stamp. A new reading of the current or of the contactors invalidates
-/// all fields. A new temperature invalidates only `sensor`.
+/// Inputs shared by readings with the same time stamp. A new current or contactor reading invalidates all fields; a new
+/// temperature invalidates only `sensor`.
 #[derive(Debug, Clone, Copy, Default)]
 struct SharedInputs {
     /// Whether the other fields are valid.
@@ -112,7 +103,7 @@ struct SharedInputs {
     totals: ChargeTotals,
     cell_current_a: Option<f64>,
     cell_charge_as: f64,
-    /// The temperature sensor that the last sample used, and its value. Neighbouring cells often share a sensor.
+    /// The latest sensor and its value, because neighbouring cells often share a sensor.
     sensor: Option<(SensorIndex, Option<f64>)>,
 }
 
@@ -145,17 +136,13 @@ impl Sampler {
         &self.config
     }
 
-    /// Replaces the limits and keeps the state of the signals.
-    ///
-    /// # Panics
-    /// Panics if the configuration has other signals. The caller must check this first.
+    /// Replaces the limits and keeps the state of the signals. Panics if the configuration has other signals.
     pub fn reconfigure(&mut self, config: &SampleConfig) {
         let state = std::mem::replace(self, Self::new(config.clone())).state;
         self.restore(state);
     }
 
-    /// Handles a reading; returns a sample if the reading is a good voltage. Appends a change of the signal to
-    /// `changes`.
+    /// Handles a reading. Returns a sample for a good voltage. Appends a change of the signal to `changes`.
     pub fn handle_reading(
         &mut self,
         time: Timestamp,
@@ -185,7 +172,7 @@ impl Sampler {
         counts.levels_believed = counts.levels_believed.saturating_add(u64::from(judged.is_new_level));
         if let Some(state) = judged.change {
             changes.push(SignalChange { channel, state });
-            // A change always alternates between good and bad, so the count never falls below 0.
+            // Changes alternate between good and bad, so the count never falls below 0.
             self.bad_signals = if state.is_err() { self.bad_signals + 1 } else { self.bad_signals - 1 };
             self.next_stale = None;
         }
@@ -223,20 +210,17 @@ impl Sampler {
         }
     }
 
-    /// Whether the reading of the current is frozen while the voltages show a changing load.
+    /// Whether the current reading is frozen while the voltages show a changing load.
     pub fn is_current_frozen(&self) -> bool {
         self.state.frozen.is_frozen()
     }
 
-    /// Change of the pack current that exceeds the noise of the current sensor (A).
+    /// Change of the pack current that exceeds the sensor's noise (A).
     pub fn flow_a(&self) -> f64 {
         self.flow_a
     }
 
-    /// Direction of the current: 1 = discharge, -1 = charge.
-    ///
-    /// # Errors
-    /// The latest reading of the direction is bad or too old.
+    /// Direction of the current: 1 = discharge, -1 = charge. Fails if the latest reading is bad or too old.
     fn direction(&self, time: Timestamp) -> Result<f64, Fault> {
         let limits = limits(&self.config, Channel::CurrentDirection);
         let signal = self.slot(Channel::CurrentDirection).map(|slot| &self.state.signals[slot]);
@@ -260,7 +244,7 @@ impl Sampler {
         self.shared.is_known = false;
     }
 
-    /// Checks ages at `now`; appends signals that have become stale to `changes`.
+    /// Checks ages at `now`. Appends signals that have become stale to `changes`.
     pub fn poll(&mut self, now: Timestamp, changes: &mut Vec<SignalChange>) {
         let now = self.advance(now);
         if self.next_stale.is_some_and(|next| now <= next) {
@@ -284,8 +268,8 @@ impl Sampler {
         self.next_stale = Some(next);
     }
 
-    /// Handles a gap of unknown length before `time`. Afterwards, no value is fresh, and ages start at `time`. No
-    /// charge is counted for the gap.
+    /// Handles a gap of unknown length. Afterwards, no value is fresh, and ages start at `time`. No charge is counted
+    /// for the gap.
     pub fn handle_gap(&mut self, time: Timestamp) {
         self.state.charge.handle_gap(self.state.latest, time, self.config.current.max_age_s);
         self.state.signals.iter_mut().for_each(Signal::handle_gap);
@@ -295,14 +279,13 @@ impl Sampler {
         (self.next_stale, self.shared.is_known) = (None, false);
     }
 
-    /// Handles the end of a sleep at `time`. Values keep their age, but the time asleep does not make a signal silent
-    /// or stale.
+    /// Handles the end of a sleep. Values keep their age, but the time asleep does not make a signal silent or stale.
     pub fn wake(&mut self, time: Timestamp) {
         self.state.began = Some(time);
         self.next_stale = None;
     }
 
-    /// Pack current (A), positive = discharge, if its last good reading is fresh; 0 while the contactors are open.
+    /// Pack current (A) if its last good reading is fresh; 0 while the contactors are open.
     #[inline]
     pub fn pack_current_a(&self, now: Timestamp) -> Option<f64> {
         if self.state.charge.is_open(now) {
@@ -311,7 +294,7 @@ impl Sampler {
         self.state.signals[0].fresh(now, &self.config.current)
     }
 
-    /// Current of one cell (A): the pack current divided by the number of strings.
+    /// Pack current divided by the number of strings (A).
     pub fn cell_current_a(&self, now: Timestamp) -> Option<f64> {
         self.pack_current_a(now).map(|current| current / self.strings())
     }
@@ -327,8 +310,7 @@ impl Sampler {
         self.sensor_c(self.sensor_of(cell)?, now)
     }
 
-    /// Whether a stored state has this sampler's number of signals. Only the last signal, which is the contactor
-    /// signal, may be missing.
+    /// Whether a stored state has this sampler's signals. Only the contactor signal may be missing.
     pub fn fits(&self, state: &SamplerState) -> bool {
         let (own, stored) = (self.state.signals.len(), state.signals.len());
         stored == own || (self.config.contactor.is_some() && stored + 1 == own)
@@ -339,14 +321,14 @@ impl Sampler {
         ReadingCounts { unused: self.state.unused_readings, ..self.state.counts }
     }
 
-    /// Returns the state for storing.
+    /// The state to store.
     pub fn snapshot(&self) -> SamplerState {
         let (strings, series) = (self.config.strings, self.config.series());
         SamplerState { strings, series, ..self.state.clone() }
     }
 
-    /// Restores a stored state. The caller has rebased the times and checked that the state [`fits`](Self::fits). The
-    /// downtime counts as unmeasured, like any other time without readings of the current.
+    /// Restores a stored state that [`fits`](Self::fits) and whose times were rebased. The downtime counts as
+    /// unmeasured.
     pub fn restore(&mut self, state: SamplerState) {
         assert!(self.fits(&state), "the stored state must have the same signals");
         let signals = self.state.signals.len();
@@ -359,7 +341,7 @@ impl Sampler {
         (self.next_stale, self.shared.is_known) = (None, false);
     }
 
-    /// Current and counters at `now`, for voltages that are measured now and arrive later.
+    /// Current and counters, for voltages that are measured at `now` and arrive later.
     pub fn moment(&mut self, now: Timestamp) -> Moment {
         let time = self.advance(now);
         self.refresh_shared_inputs(time);
@@ -410,8 +392,7 @@ impl Sampler {
         self.state.signals[1 + sensor.index()].fresh(now, &self.config.temperature)
     }
 
-    /// Advances the clock to `time` and returns the latest time so far, which is later than `time` if the clock went
-    /// back.
+    /// Advances the clock and returns the latest time so far, because time stamps may go back.
     #[inline]
     fn advance(&mut self, time: Timestamp) -> Timestamp {
         if self.state.began.is_none() {
@@ -428,7 +409,7 @@ impl Sampler {
         f64::from(self.config.strings.max(1))
     }
 
-    /// Divisor that converts a reading to a cell's value. A total voltage is divided by the number of cells in series.
+    /// Divisor for a reading. Only a total voltage is divided, by the number of cells in series.
     #[inline]
     fn divisor(&self, channel: Channel) -> f64 {
         match self.config.voltage_source {
@@ -449,7 +430,7 @@ impl Sampler {
             }
             (Channel::PackVoltage, VoltageSource::Cells)
             | (Channel::CellVoltage(_), VoltageSource::PackTotal { .. })
-            // The monitor uses these channels; they are not sampled.
+            // The monitor uses these channels, which are not sampled.
             | (Channel::SupplyVoltage | Channel::Balancing(_) | Channel::PackIdentity, _) => None,
             (Channel::ReportedSoc | Channel::ReportedSoh | Channel::CurrentDirection | Channel::Contactor, _) => {
                 let first = voltage + self.voltages;

@@ -5,13 +5,13 @@
 //!
 //! * **Range**: a value outside the limits is bad.
 //! * **Rate**: a value is bad if its distance from the last good value exceeds the fastest plausible change. If
-//!   [`ACCEPT_AFTER`] consecutive readings agree with each other, the last of them is accepted: the step was real or
-//!   the last good value was wrong. Further rejection would lock out a healthy sensor.
+//!   [`ACCEPT_AFTER`] consecutive readings agree with each other, the last of them is accepted, because the step was
+//!   real or the last good value was wrong. Further rejection would lock out a healthy sensor.
 //! * **Stuck**: a value that stays exactly the same for too long while it should change is bad until it changes. The
 //!   caller passes a clock that runs only while the value should change.
 //! * **Stale**: the last good value is older than the maximum age.
 //!
-//! A fault found by the decoder is passed on. A bad reading never becomes the signal's value.
+//! A fault found by the decoder is passed on.
 
 use serde::{Deserialize, Serialize};
 
@@ -19,7 +19,7 @@ use super::config::Limits;
 use crate::quantity::bounds;
 use crate::quantity::{Fault, InvalidState, Timestamp};
 
-/// Number of consecutive readings that must agree on a new level. Two readings could come from one disturbance.
+/// Readings that must agree on a new level. A single disturbance could cause two.
 pub const ACCEPT_AFTER: u32 = 3;
 
 /// Shortest interval for the rate check (s). Time stamps of consecutive frames jitter by about this much, and the rate
@@ -44,36 +44,35 @@ impl TimedValue {
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(super) struct Signal {
     pub(super) good: Option<TimedValue>,
-    /// Latest reading rejected because of its rate.
+    /// Latest reading that was rejected because of its rate.
     refused: Option<TimedValue>,
-    /// Number of consecutive readings that agree with `refused`.
+    /// Consecutive readings that agree with `refused`.
     refused_count: u32,
-    /// The latest value, unchanged since the stuck clock showed `rests_since_s`.
+    /// Unchanged since the stuck clock showed `rests_since_s`.
     rests_at: Option<f64>,
-    /// Time of the stuck clock at the last change of the value (s).
     rests_since_s: f64,
     /// Time of the latest reading, good or bad.
     #[serde(rename = "heard")]
     pub(super) received: Option<Timestamp>,
     fault: Option<Fault>,
-    /// Bad readings since the signal turned bad.
+    /// Number of bad readings since the signal turned bad.
     bad_readings: u64,
-    /// Number of readings so far, up to [`BAD_SHARE_READINGS`].
+    /// Up to [`BAD_SHARE_READINGS`].
     readings: u32,
     bad_share: f64,
 }
 
-/// Outcome of a reading: the checked value, and the signal's new state if the state changed. `Ok` means that the signal
-/// is good again; it contains the number of preceding bad readings.
+/// Outcome of a reading: the checked value, and the new state if it changed. `Ok` contains the number of preceding bad
+/// readings.
 pub(super) struct SignalUpdate {
     pub(super) value: Result<f64, Fault>,
     pub(super) change: Option<Result<u64, Fault>>,
-    /// Whether a step to a new level is accepted now, after its first readings were rejected.
+    /// Whether a new level is accepted after its first readings were rejected.
     pub(super) is_new_level: bool,
 }
 
 impl Signal {
-    /// Checks a reading and updates the signal. `should_move_s` is the clock of the stuck check.
+    /// Checks a reading. `should_move_s` is the clock of the stuck check.
     #[inline]
     pub(super) fn handle(
         &mut self,
@@ -99,7 +98,7 @@ impl Signal {
         Fault::Stale
     }
 
-    /// Time from which the signal is stale if no good reading arrives. The signal's age does not start before `began`.
+    /// Earliest time at which the signal is stale. Its age does not start before `began`.
     pub(super) fn stale_from(&self, began: Timestamp, limits: &Limits) -> Timestamp {
         self.good.map_or(began, |good| good.time.max(began)).plus_secs(limits.max_age_s)
     }
@@ -114,7 +113,7 @@ impl Signal {
         self.good.filter(|good| now.since(good.time) <= limits.max_age_s).map(|good| good.value)
     }
 
-    /// Time of the latest reading, and the share of bad readings; `None` = no reading since `began`.
+    /// Time of the latest reading, and share of bad readings; `None` = no reading since `began`.
     #[inline]
     pub(super) fn latest_since(&self, began: Timestamp) -> Option<(Timestamp, f64)> {
         Some((self.received.filter(|&received| received >= began)?, self.bad_share))
@@ -125,7 +124,7 @@ impl Signal {
         (self.readings > 0).then_some(self.bad_share)
     }
 
-    /// Handles a gap of unknown length. Forgets values and times, but keeps the fault and the share of bad readings.
+    /// Handles a gap. Forgets values and times, but keeps the fault and the share of bad readings.
     pub(super) fn handle_gap(&mut self) {
         *self = Self {
             fault: self.fault,
@@ -136,7 +135,6 @@ impl Signal {
         };
     }
 
-    /// Checks a stored signal; the error is the first impossible number.
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         let values = [self.good, self.refused].into_iter().flatten().map(|stamped| stamped.value);
         InvalidState::unless_numbers("a signal", values.chain(self.rests_at))?;

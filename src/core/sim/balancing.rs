@@ -1,8 +1,8 @@
 //! Simulates passive balancing: the BMS bleeds cells whose voltage is above the lowest cell voltage.
 //!
 //! The BMS bleeds cells near the end of a charge and during the first rest after the charge, even while the buses
-//! sleep. A drive between the charge and that rest pauses the balancing. The BMS compares the voltages that its own
-//! channels measure. These voltages include the channels' constant offsets, but no noise, because a BMS averages its
+//! sleep. If the car drives before this rest, balancing pauses during the drive. The BMS compares the voltages that its
+//! own channels measure. These voltages include the channels' constant offsets but no noise, because a BMS averages its
 //! readings.
 
 use super::truth::Pack;
@@ -12,17 +12,16 @@ use super::truth::Pack;
 pub struct Balancing {
     /// Current of a balancing resistor (A).
     pub bleed_a: f64,
-    /// Bleeding of a cell starts when the cell's voltage exceeds the lowest cell voltage by this value (V).
+    /// Difference to the lowest cell voltage (V) at which the BMS starts to bleed a cell.
     pub start_v: f64,
-    /// Bleeding of a cell stops when the cell's voltage exceeds the lowest cell voltage by less than this value (V).
+    /// Difference to the lowest cell voltage (V) below which the BMS stops bleeding a cell.
     pub stop_v: f64,
-    /// A charge is near its end if the fullest cell has at least this SOC.
+    /// If the fullest cell has at least this SOC, a charge is near its end.
     pub from_soc: f64,
 }
 
 impl Balancing {
-    /// Settings of a typical BMS for cells of `capacity_ah`: a bleed current of 1 mA per Ah (60 mA at 60 Ah), a start
-    /// at 10 mV and a stop at 5 mV.
+    /// Settings of a typical BMS for cells of `capacity_ah`: it bleeds 1 mA per Ah, starts at 10 mV and stops at 5 mV.
     pub fn usual(capacity_ah: f64) -> Self {
         Self { bleed_a: 1e-3 * capacity_ah, start_v: 0.010, stop_v: 0.005, from_soc: 0.7 }
     }
@@ -32,7 +31,7 @@ impl Balancing {
 pub(crate) struct Balancer {
     settings: Balancing,
     charging_s: f64,
-    /// Whether a charge is or was near its end, and the first rest after it has not ended yet.
+    /// True from near the end of a charge until the end of the first rest after it.
     is_armed: bool,
     has_rested: bool,
 }
@@ -43,12 +42,12 @@ impl Balancer {
     }
 
     /// Switches the resistors for the next step, after `dt_s` seconds with `current_a`. `offset_v` returns a channel's
-    /// offset.
+    /// offset (V).
     pub(crate) fn update(&mut self, pack: &mut Pack, current_a: f64, dt_s: f64, offset_v: impl Fn(usize) -> f64) {
-        // Largest current that counts as rest: 0.002 C.
+        // A current of at most 0.002 C counts as rest.
         let is_rest = current_a.abs() <= 0.002 * pack.lowest_capacity_ah();
         self.charging_s = if current_a < 0.0 && !is_rest { self.charging_s + dt_s } else { 0.0 };
-        // A charge must last at least 60 s, so that regenerative braking does not count as a charge.
+        // Regenerative braking is shorter than 60 s, so it does not count as a charge.
         let ends_charge = self.charging_s >= 60.0 && pack.highest_soc() >= self.settings.from_soc;
         if ends_charge {
             (self.is_armed, self.has_rested) = (true, false);

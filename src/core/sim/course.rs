@@ -1,7 +1,4 @@
 //! Determines the course of the current: a scenario's next demand, given the pack's true state.
-//!
-//! The simulation asks the course for a demand at each sample of the current. A demand is one of: a current until the
-//! next sample, a sleep, the end of the course.
 
 mod cycle;
 mod demand;
@@ -35,7 +32,7 @@ impl Course {
         }
     }
 
-    /// The demand for the next `dt_s` seconds. At the end of a cycle, also applies the ageing per cycle to the pack.
+    /// The demand for the next `dt_s` seconds. At the end of a cycle, applies the ageing per cycle to the pack.
     pub(crate) fn next(&mut self, pack: &mut Pack, dt_s: f64) -> Demand {
         match self {
             Self::Cycle(course) => course.next(pack, dt_s),

@@ -1,8 +1,8 @@
 //! Faults that a simulation injects into cells, contacts, modules and sensors.
 //!
-//! A fault starts at a given time of the simulation and lasts until the end. Faults of cells change the true state
-//! ([`Pack`](super::Pack)); faults of sensors change only the readings. The text form is `KIND:...@WHEN` ([`Fault`]'s
-//! `FromStr`). In the text, cells and temperature sensors count from 1; internally, from 0.
+//! A fault starts at a given time and lasts until the end of the simulation. Faults of cells change the true state
+//! ([`Pack`](super::Pack)). Faults of sensors change only the readings. The text form is `KIND:...@WHEN` ([`Fault`]'s
+//! `FromStr`). In this text, cells and temperature sensors count from 1. In the code, they count from 0.
 
 mod parse;
 pub(crate) mod sensed;
@@ -14,7 +14,7 @@ use crate::quantity::{CellIndex, SensorIndex};
 pub struct Fault {
     /// Kind, location and size.
     pub kind: FaultKind,
-    /// Start of the fault after the start of the simulation (s).
+    /// Time from the start of the simulation to the start of the fault (s).
     pub from_s: f64,
 }
 
@@ -23,21 +23,21 @@ pub struct Fault {
 pub enum Leak {
     /// A constant leakage current (A).
     Current(f64),
-    /// A soft short circuit with this resistance (ohm). The current is the unloaded cell voltage divided by the
+    /// A soft short circuit with this resistance (ohm). Its current is the unloaded cell voltage divided by the
     /// resistance.
     Resistance(f64),
 }
 
-/// Size of a contact's resistance.
+/// Size of a contact resistance.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum ContactResistance {
     /// Resistance (ohm).
     Ohm(f64),
-    /// Share of the cell's own ohmic resistance at SOC 50 % and 25 degrees C when the fault starts.
+    /// Share of the cell's ohmic resistance at SOC 50 % and 25 degrees C when the fault starts.
     OfCell(f64),
 }
 
-/// Kind, location and size of a fault. Changes without a unit are relative: 0.1 = 10 % more.
+/// Kind, location and size of a fault. Changes are relative unless they have a unit: 0.1 = 10 % more.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum FaultKind {
     /// The cell loses charge continuously, even at rest.
@@ -47,8 +47,8 @@ pub enum FaultKind {
         /// Size of the leak.
         leak: Leak,
     },
-    /// A resistance in series with the cell, between its two voltage taps. The resistance does not depend on
-    /// temperature, and its heat warms no cell.
+    /// A resistance in series with the cell, between its voltage taps. It does not depend on temperature and warms no
+    /// cell.
     Contact {
         /// The cell.
         cell: CellIndex,
@@ -62,15 +62,15 @@ pub enum FaultKind {
         /// Change of the capacity.
         change: f64,
     },
-    /// All resistances of the cell change; they still follow the model's temperature dependence.
+    /// All resistances of the cell change. They still depend on temperature as in the model.
     Resistance {
         /// The cell.
         cell: CellIndex,
         /// Change of the resistance.
         change: f64,
     },
-    /// Several cells are replaced: their capacity changes, their resistance is as new, and each gets the mean SOC of
-    /// the replaced cells.
+    /// The cells of a module are replaced. Their capacity changes, their resistance is as new, and their SOC becomes
+    /// the mean SOC of the replaced cells.
     Module {
         /// First cell.
         first: CellIndex,
@@ -131,7 +131,6 @@ impl FaultError {
 }
 
 impl FaultKind {
-    /// Cells that the fault names.
     fn cells(&self) -> [Option<CellIndex>; 2] {
         match *self {
             Self::Leak { cell, .. }

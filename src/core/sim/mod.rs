@@ -1,19 +1,19 @@
 //! The simulator: a pack with a known true state, its sensors, and the scenarios that load it.
 //!
-//! In: a cell model, settings and a seed. Out: readings at their sampling times, as a BMS would measure them, and the
-//! true state. All randomness is seeded, and functions such as `exp` and `sin` come from `libm`. The same seed
-//! therefore gives the same bytes on every machine.
+//! In: a cell model, settings and a seed. Out: readings at their sampling times, and the true state. The same seed
+//! gives the same bytes on every machine, because all randomness is seeded, and `exp`, `sin` and similar functions come
+//! from `libm`.
 //!
 //! | file | purpose |
 //! | --- | --- |
-//! | [`truth`] | the true cells: circuit, hysteresis, heat, ageing, spread |
-//! | [`sensor`] | sensor errors: gain, offset, noise, resolution, dropout; qualities |
-//! | `noise` | the seeded random numbers |
+//! | [`truth`] | the true cells: circuit, hysteresis, heat, ageing, differences between cells |
+//! | [`sensor`] | sensor errors: gain, offset, noise, resolution, dropout |
+//! | `noise` | seeded random numbers |
 //! | [`scenario`] | the named scenarios and their settings |
-//! | `course` | the current that a scenario demands next |
+//! | `course` | the next current of a scenario |
 //! | [`fault`] | injected faults of cells, contacts, modules and sensors |
 //! | [`balancing`] | passive balancing by the BMS |
-//! | [`run`] | the loop: truth, course and sensors stepped together |
+//! | [`run`] | the loop that steps true state, course and sensors |
 
 pub mod balancing;
 mod course;

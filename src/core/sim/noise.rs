@@ -1,16 +1,13 @@
 //! Generates seeded random numbers that are bit-identical on every machine.
 //!
-//! The generator is ChaCha with 8 rounds, keyed by the seed. Each use has its own stream, so that more cells or another
-//! scenario do not change the numbers of other streams. A uniform number is the upper 53 bits of a 64-bit word divided
-//! by 2^53, in [0, 1). A normal number comes from Box-Muller (both values of a pair are used) with `ln`, `sin` and
-//! `cos` of `libm`.
+//! The generator is ChaCha with 8 rounds. Each use has its own stream, so that more cells or another scenario do not
+//! change the numbers of other streams. Normal numbers come from Box-Muller with `ln`, `sin` and `cos` of `libm`.
 
 use rand::Rng;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-/// Use of a stream of random numbers. The number of a stream affects results, so it never changes and is never reused
-/// for another purpose.
+/// Use of a stream of random numbers. A stream's number must never change or be reused, because results depend on it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Stream {
     Spread,
@@ -45,9 +42,9 @@ impl Noise {
         Self::of_number(seed, stream.number())
     }
 
-    /// Creates the stream for the constant errors of a sensor whose noise uses `stream`.
+    /// The stream for the constant errors of a sensor whose noise uses `stream`.
     pub(crate) fn of_channel(seed: u64, stream: Stream) -> Self {
-        // Constant errors use stream numbers from 0x10_0000; all noise streams have lower numbers.
+        // Noise streams have numbers below 0x10_0000.
         Self::of_number(seed, 0x10_0000 + stream.number())
     }
 
@@ -68,7 +65,6 @@ impl Noise {
         low + (high - low) * self.uniform()
     }
 
-    /// One of `choices`, each equally likely.
     pub(crate) fn choose<T: Copy, const N: usize>(&mut self, choices: &[T; N]) -> T {
         const { assert!(N > 0) };
         choices[((self.uniform() * N as f64) as usize).min(N - 1)]
@@ -79,7 +75,7 @@ impl Noise {
         if let Some(spare) = self.spare_normal.take() {
             return spare;
         }
-        let radius = (-2.0 * libm::log(1.0 - self.uniform())).sqrt(); // 1 - u: never ln(0)
+        let radius = (-2.0 * libm::log(1.0 - self.uniform())).sqrt(); // 1 - u is never 0
         let angle = std::f64::consts::TAU * self.uniform();
         self.spare_normal = Some(radius * libm::sin(angle));
         radius * libm::cos(angle)

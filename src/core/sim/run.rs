@@ -1,10 +1,8 @@
-//! The simulation's loop: steps the true state, the course of the current and the sensors together, and returns
-//! readings.
+//! The simulation's loop: steps the true state, the course of the current and the sensors, and returns readings.
 //!
-//! At each moment, the current until the next moment is already known. The voltages of the moment include the drop that
-//! this current causes. Cells are stepped once per cell sampling period, with the mean current of the period. With this
-//! simplification, the charge remains exact, but the branch voltages differ slightly from a simulation that steps the
-//! cells at every current sample. The relative difference is less than `period / (2 tau)`, where `tau` is the branch's
+//! At each moment, the current until the next moment is already known, so the voltages include the drop that this
+//! current causes. Cells are stepped once per cell sampling period with the mean current of the period. This keeps the
+//! charge exact. The relative error of a branch voltage is less than `period / (2 tau)`, where `tau` is the branch's
 //! time constant.
 
 use super::balancing::{Balancer, Balancing};
@@ -18,7 +16,7 @@ use super::truth::Pack;
 use crate::cell::CellModel;
 use crate::quantity::{CellIndex, Channel, SensorIndex, Timestamp};
 
-/// Wiring and sensors of the pack.
+/// Strings and temperature sensors of the pack.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Wiring {
     /// Number of parallel strings. The pack current is the cell current times this number.
@@ -28,7 +26,7 @@ pub struct Wiring {
 }
 
 impl Wiring {
-    /// One string, one temperature sensor on the first cell.
+    /// One string, with one temperature sensor on the first cell.
     pub fn single() -> Self {
         Self { strings: 1, temperature_at: vec![Some(CellIndex(0))] }
     }
@@ -39,7 +37,7 @@ impl Wiring {
 pub struct Moment {
     /// Time since the start.
     pub time: Timestamp,
-    /// True cell current from this moment on (A), positive = discharge.
+    /// True cell current from this moment on (A); positive = discharge.
     pub current_a: f64,
     /// Whether the cells were also sampled at this moment.
     pub cells_sampled: bool,
@@ -69,7 +67,6 @@ impl PackSensors {
     }
 }
 
-/// A sleep of the buses, simulated in steps.
 #[derive(Debug, Clone, Copy)]
 struct Asleep {
     from: Timestamp,
@@ -95,23 +92,23 @@ pub struct Simulation {
     readings: Vec<(Channel, Option<f64>)>,
     time: Timestamp,
     current_a: f64,
-    /// Charge (As) and time (ns) since the cells were last stepped.
+    /// Charge (A s) and time (ns) since the cells were last stepped.
     pending: (f64, i64),
     cells_due: bool,
     started: bool,
-    /// Faults that have not started; the fault that starts next is the last element.
+    /// Faults that have not started, in reverse order of their start.
     coming: Vec<Fault>,
     sensor_faults: SensorFaults,
     balancer: Option<Balancer>,
     has_bits: bool,
     asleep: Option<Asleep>,
-    /// Voltages of the cells (V): first at the taps; after the sensor faults were applied, at the channels.
+    /// Voltages of the cells (V): first at the taps, then with sensor faults.
     sensed_v: Vec<f64>,
 }
 
 impl Simulation {
-    /// Creates a simulation at its start. Apart from the spread, the cells have the capacity
-    /// `settings.pack.capacity_ah`; everything else follows `model`.
+    /// Creates a simulation at its start. The mean capacity of the cells is `settings.pack.capacity_ah`; all other
+    /// properties follow `model`.
     pub fn new(model: CellModel, settings: Settings, wiring: Wiring) -> Self {
         Self {
             pack: Pack::new(model, settings.pack, settings.seed),
@@ -150,9 +147,8 @@ impl Simulation {
         self
     }
 
-    /// Makes the BMS send a balancing bit for each cell: 1 = the cell is bled, 0 = the cell is not bled. The BMS sends
-    /// the bits together with the voltages. During sleep, the BMS sends the bits every minute while it bleeds a cell,
-    /// and once more when it has stopped bleeding.
+    /// Makes the BMS send a balancing bit for each cell together with the voltages (1 = the cell is bled). During
+    /// sleep, the BMS sends the bits every minute while it bleeds a cell, and once more when it has stopped.
     #[must_use]
     pub fn with_balancing_bits(mut self) -> Self {
         self.has_bits = true;
@@ -188,13 +184,12 @@ impl Simulation {
         Some(Moment { time: self.time, current_a: self.current_a, cells_sampled })
     }
 
-    /// Readings of the latest moment; a value of `None` means that the sample is missing.
+    /// Readings of the latest moment. A value of `None` means that the sample is missing.
     pub fn readings(&self) -> &[(Channel, Option<f64>)] {
         &self.readings
     }
 
-    /// Constant errors of the current sensor (A) and of each cell's voltage sensor (V). Injected faults are not
-    /// included.
+    /// Constant errors of the current sensor (A) and of each cell's voltage sensor (V), without injected faults.
     pub fn sensor_offsets(&self) -> (f64, Vec<f64>) {
         (self.sensors.current.offset(), self.sensors.voltages.iter().map(Sensor::offset).collect())
     }
@@ -231,13 +226,12 @@ impl Simulation {
     fn fall_asleep(&mut self, duration_s: f64) {
         self.step_pending();
         self.current_a = 0.0;
-        // A step during sleep takes at most 60 s, so that changing resistances and temperatures cause only a small
-        // error.
+        // The steps take at most 60 s, because resistances and temperatures change during sleep.
         let steps = (duration_s / 60.0).ceil().max(1.0) as u32;
         self.asleep = Some(Asleep { from: self.time, duration_s, step: 0, steps });
     }
 
-    /// Continues a sleep in progress. Returns whether balancing bits were reported before the end of the sleep.
+    /// Continues a sleep. Returns whether balancing bits were reported before the end of the sleep.
     fn sleep(&mut self) -> bool {
         while let Some(asleep) = &mut self.asleep {
             let (now, step_s) = (asleep.time(), asleep.duration_s / f64::from(asleep.steps));
@@ -269,7 +263,6 @@ impl Simulation {
         self.readings.extend(bits.map(|(cell, bit)| (Channel::Balancing(cell), Some(bit))));
     }
 
-    /// Steps the cells with `current_a` for `dt_s` seconds; then the BMS switches its resistors.
     fn step_cells(&mut self, current_a: f64, dt_s: f64) {
         self.pack.step(current_a, dt_s);
         if let Some(balancer) = &mut self.balancer {
@@ -309,8 +302,7 @@ impl Simulation {
         }
     }
 
-    /// Measures the cell voltages and the pack voltage. A contact's resistance is between the taps, so the voltage drop
-    /// appears in both voltages.
+    /// Measures the cell voltages and the pack voltage. Both include the drop of a contact, which is between the taps.
     fn measure_voltages(&mut self) {
         self.sensed_v.clear();
         let taps = self.pack.voltages_v(self.current_a).zip(self.pack.cells());

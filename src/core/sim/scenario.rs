@@ -1,13 +1,13 @@
 //! Defines the named scenarios and their settings.
 //!
-//! The currents and charges below apply to a cell with the nominal capacity of the source. They scale with the capacity
-//! of the configured cell model, so that any configuration can be simulated.
+//! Currents and charges in the table apply to a cell with the nominal capacity. They scale with the capacity of the
+//! configured cell model.
 //!
 //! | scenario | nominal capacity | source | course |
 //! | --- | --- | --- | --- |
-//! | `paper` | 2.6 Ah | the run in the paper that packwatch follows | 1.325 A in both directions between SOC 0.3 and 0.9; 48 cycles (2.23e5 s), from a capacity of 2.6 Ah down to 0.25 Ah; each completed cycle loses 0.05 Ah, and the last cycle does not count as completed |
-//! | `reference` | 30 Ah | a published example | discharge with random pulses (mean 15 A) to SOC 0.3, charge with 15 A to SOC 0.9; each cycle loses 1 Ah |
-//! | `random-walk` | 2.1 Ah | the protocol of NASA's randomized set | loads of 5 min with currents of -4.5 to 4.5 A, within 3.2 to 4.2 V; two reference cycles after every 1,500 loads |
+//! | `paper` | 2.6 Ah | "Battery Predictions for Electronic Prognostics" | 1.325 A between SOC 0.3 and 0.9; 48 cycles (2.23e5 s) |
+//! | `reference` | 30 Ah | a published example | random discharge pulses to SOC 0.3, charge with 15 A to SOC 0.9; -1 Ah per cycle |
+//! | `random-walk` | 2.1 Ah | NASA's randomized set | loads of 5 min (-4.5 to 4.5 A, 3.2 to 4.2 V); 2 reference cycles after 1,500 loads |
 //! | `ev-day` | 50 Ah | packwatch | drive, park (buses asleep), drive, fast charge, drive, park; 96 cells |
 
 use super::sensor::{SensorError, Sensors};
@@ -16,7 +16,7 @@ use super::truth::{Ageing, Hysteresis, PackSettings, Spread};
 /// A named scenario.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Scenario {
-    /// The paper's run: 2.6 Ah, -0.05 Ah per cycle, SOC 30-90 %, until 0.25 Ah.
+    /// The run of the paper: 2.6 Ah, -0.05 Ah per cycle, SOC 30-90 %, until 0.25 Ah.
     Paper,
     /// A published example with a cell of 30 Ah: random discharge pulses, -1 Ah per cycle.
     Reference,
@@ -37,9 +37,9 @@ pub struct Settings {
     pub pack: PackSettings,
     /// Errors of the sensors.
     pub sensors: Sensors,
-    /// Time between current samples, ns.
+    /// Time between current samples (ns).
     pub current_period_ns: i64,
-    /// Time between samples of voltages and temperatures, ns; a multiple of `current_period_ns`.
+    /// Time between samples of voltages and temperatures (ns); a multiple of `current_period_ns`.
     pub cell_period_ns: i64,
     /// The simulation ends after this number of the scenario's cycles; `None` = no limit.
     pub cycles: Option<u32>,
@@ -48,9 +48,9 @@ pub struct Settings {
     /// The simulation ends after the cycle in which the weakest cell reaches this capacity (Ah); 0 = no limit. `ev-day`
     /// ignores this limit.
     pub end_capacity_ah: f64,
-    /// Lower and upper SOC of the cycling scenarios: charging starts at the lower SOC, discharging at the upper SOC.
+    /// SOC window of the cycling scenarios: charging starts at the lower SOC, discharging at the upper SOC.
     pub soc_window: (f64, f64),
-    /// Number of loads between two reference measurements, in the random walk.
+    /// Number of loads between two reference measurements, for the random walk.
     pub walk_steps: u32,
 }
 
@@ -85,7 +85,7 @@ impl Settings {
                 leakage_a: 0.0,
                 ambient_c: 25.0,
             },
-            // Sensor errors that the accuracy requirement assumes for the paper's scenario.
+            // The accuracy requirement assumes these sensor errors for the paper's scenario.
             sensors: Sensors {
                 current: SensorError { noise_std: 0.02, offset: 0.01, gain: 0.005, ..SensorError::NONE },
                 voltage: SensorError { noise_std: 0.005, ..SensorError::NONE },
@@ -101,7 +101,7 @@ impl Settings {
         };
         match scenario {
             Scenario::Paper => {}
-            // The only sensor error is the voltage noise that the example's filter assumes (R = 1e-3: 32 mV).
+            // The only sensor error is the voltage noise that the example's filter assumes (R = 1e-3, which is 32 mV).
             Scenario::Reference => {
                 s.pack.initial_soc = 1.0;
                 s.pack.ageing.capacity_loss_ah_per_cycle = scale;
@@ -109,8 +109,7 @@ impl Settings {
                 s.sensors = Sensors { voltage, ..Sensors::default() };
                 (s.end_capacity_ah, s.cycles) = (0.0, Some(10));
             }
-            // With this ageing, a block of 1,500 loads (about 310 Ah) costs about 5 % capacity and adds about 10 %
-            // resistance, as in the measured cells.
+            // In the measured cells, 1,500 loads (about 310 Ah) cost about 5 % capacity and add about 10 % resistance.
             Scenario::RandomWalk => {
                 s.pack.ageing = Ageing {
                     capacity_loss_ah_per_ah: 3.4e-4,
@@ -124,8 +123,7 @@ impl Settings {
         s
     }
 
-    /// Sets sampling periods of 10 ms for the current and 100 ms for the cells. Sets the sensor errors and the spread
-    /// of a typical pack, for example 0.5 % gain error, 1 mV noise and 1 % capacity spread.
+    /// Sampling periods, sensor errors and differences between cells of a typical pack.
     fn set_ev_day(&mut self) {
         let capacity_ah = self.pack.capacity_ah;
         self.pack.cells = 96;
@@ -136,7 +134,7 @@ impl Settings {
         let (noise_std, offset) = (0.002 * capacity_ah, 0.0005 * capacity_ah);
         self.sensors.current = SensorError { noise_std, offset, gain: 0.005, ..SensorError::default() };
         self.sensors.voltage.noise_std = 0.001;
-        // At ten samples a second, more noise would look like a temperature change of 5 K/s, a usual limit.
+        // At ten samples a second, more noise would look like a temperature change of 5 K/s, which is a usual limit.
         self.sensors.temperature.noise_std = 0.02;
         (self.current_period_ns, self.cell_period_ns) = (SECOND_NS / 100, SECOND_NS / 10);
         (self.end_capacity_ah, self.duration_s) = (0.0, Some(86_400.0));

@@ -1,8 +1,7 @@
 //! Simulates sensors: turns true values into readings with errors.
 //!
 //! `reading = round_to_resolution(truth (1 + gain) + offset + noise_std n)`. n is normally distributed and independent
-//! from sample to sample. A reading is missing with the probability `dropout`. Resolution 0 leaves quantisation to the
-//! signal's encoding in the DBC. Each channel adds its own constant errors, drawn once from the seed.
+//! from sample to sample. Resolution 0 leaves quantisation to the signal's encoding in the DBC.
 
 use super::noise::{Noise, Stream};
 
@@ -11,7 +10,7 @@ use super::noise::{Noise, Stream};
 pub struct SensorError {
     /// Standard deviation of the white noise per sample.
     pub noise_std: f64,
-    /// Constant error.
+    /// Constant error of all channels.
     pub offset: f64,
     /// Relative gain error.
     pub gain: f64,
@@ -19,9 +18,9 @@ pub struct SensorError {
     pub resolution: f64,
     /// Probability that a sample is missing.
     pub dropout: f64,
-    /// Standard deviation of the offset across channels.
+    /// Standard deviation of an additional constant error per channel, drawn from the seed.
     pub offset_std: f64,
-    /// Standard deviation of the gain error across channels.
+    /// Standard deviation of an additional gain error per channel, drawn from the seed.
     pub gain_std: f64,
 }
 
@@ -31,7 +30,7 @@ impl SensorError {
         Self { noise_std: 0.0, offset: 0.0, gain: 0.0, resolution: 0.0, dropout: 0.0, offset_std: 0.0, gain_std: 0.0 };
 }
 
-/// Constant errors are clipped at this many standard deviations.
+/// Errors per channel are clipped at this many standard deviations.
 const CHANNEL_LIMIT: f64 = 2.0;
 
 /// Errors of all sensors of a pack.
@@ -39,8 +38,8 @@ const CHANNEL_LIMIT: f64 = 2.0;
 pub struct Sensors {
     /// Pack current (A).
     pub current: SensorError,
-    /// Cell voltages (V). The noise of the pack voltage is this noise times the square root of the number of cells; the
-    /// pack voltage has no offset.
+    /// Cell voltages (V). The pack voltage has no offset. Its noise is the noise of a cell voltage times the square
+    /// root of the number of cells.
     pub voltage: SensorError,
     /// Temperatures (degrees C).
     pub temperature: SensorError,
@@ -54,9 +53,9 @@ pub struct Sensors {
 /// | `Usual` | 5 mV | 1 mV | 0.5 % + 50 mA | 10 mA | 1 K |
 /// | `Poor` | 15 mV | 5 mV | 2 % + 300 mA | 60 mA | 3 K |
 ///
-/// The offsets and gains are standard deviations across channels. Each channel's offset and gain are clipped at two
-/// standard deviations and constant in time. For voltage and current, the standard deviation of the noise per sample
-/// equals one step. Temperatures have steps of 0.1 K and noise of 0.02 K.
+/// Offsets and gains are standard deviations across channels. They are clipped at two standard deviations and constant
+/// in time. For voltage and current, the standard deviation of the noise equals one step. Temperatures have steps of
+/// 0.1 K and noise of 0.02 K.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SensorQuality {
     /// Laboratory equipment, or the best vehicles.
@@ -107,12 +106,11 @@ impl Sensor {
         Self { error, noise: Noise::new(seed, stream) }
     }
 
-    /// The constant offset of the channel.
     pub(crate) fn offset(&self) -> f64 {
         self.error.offset
     }
 
-    /// Measures `truth`; `None` = the sample is missing. Both outcomes draw the same number of random numbers.
+    /// Measures `truth`; `None` = the sample is missing.
     pub(crate) fn read(&mut self, truth: f64) -> Option<f64> {
         let e = self.error;
         let value = truth * (1.0 + e.gain) + e.offset + e.noise_std * self.noise.normal();

@@ -1,17 +1,17 @@
 //! Simulates the true state of the pack, which the estimator must infer from readings.
 //!
 //! Each cell is the circuit of [`CellModel`] with its own capacity, resistance and temperature, and with effects that
-//! the estimator does not model. Current is positive for discharge. During a step of `dt` seconds, the current, the
-//! leak, the heat and the values from the tables are constant. Under this condition, every equation is solved exactly:
-//! * `SOC -= (I + I_leak) dt / (3600 C)`. `I_leak` includes self-discharge, an injected leak and the balancing
-//!   resistor. The SOC is not clamped, because SOC 0 and SOC 1 are defined by two open-circuit voltages and are not
+//! the estimator does not model. Current is positive for discharge. During a step of `dt` seconds, current, leak, heat
+//! and table values are constant, so every equation is solved exactly:
+//! * `SOC -= (I + I_leak) dt / (3600 C)`. `I_leak` contains self-discharge, an injected leak and the balancing
+//!   resistor. The SOC is not limited, because SOC 0 and SOC 1 are defined by two open-circuit voltages and are not
 //!   physical limits.
-//! * `U_i = U_i a + R_i I (1 - a)`, `a = exp(-dt / tau_i)`. Ageing scales the resistances, but not the time constants.
-//! * hysteresis, one state h in [-1, 1] (Plett): `h = h e - (1 - e) sign(I)`, `e = exp(-|I dt| gamma / (3600 C))`;
-//! * heat: `T = T_end + (T - T_end) exp(-dt / (R_th C_th))`, `T_end = T_ambient + R_th (I^2 R0 + sum U_i^2 / R_i)`.
+//! * `U_i = U_i a + R_i I (1 - a)`, `a = exp(-dt / tau_i)`.
+//! * Hysteresis state h in [-1, 1] (Plett): `h = h e - (1 - e) sign(I)`, `e = exp(-|I dt| gamma / (3600 C))`.
+//! * Heat: `T = T_end + (T - T_end) exp(-dt / (R_th C_th))`, `T_end = T_ambient + R_th (I^2 R0 + sum U_i^2 / R_i)`.
 //!
-//! Terminal voltage `V = OCV(SOC, T, C) + M h - sum U_i - I R0`.
-//! Ageing changes capacity and resistance, but not the SOC as a fraction (like the plant of the reference example).
+//! The terminal voltage is `V = OCV(SOC, T, C) + M h - sum U_i - I R0`. Ageing changes capacity and resistances. The
+//! time constants and the SOC (a fraction) stay the same.
 
 use super::fault::{ContactResistance, FaultKind, Leak};
 use super::noise::{Noise, Stream};
@@ -21,10 +21,9 @@ use crate::quantity::CellIndex;
 /// Hysteresis of the open-circuit voltage, which the estimator does not model.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Hysteresis {
-    /// Distance of the settled charge curve and of the settled discharge curve from the OCV (V); 0 = no hysteresis.
+    /// Distance of the settled charge and discharge curves from the OCV (V); 0 = no hysteresis.
     pub magnitude_v: f64,
-    /// How fast the voltage changes from one curve to the other, in e-foldings while the current moves one full
-    /// capacity.
+    /// Speed of the change from one curve to the other: number of e-foldings while the current moves one full capacity.
     pub rate: f64,
 }
 
@@ -41,9 +40,9 @@ pub struct Ageing {
     pub capacity_loss_ah_per_cycle: f64,
     /// Capacity lost per Ah moved in either direction (Ah).
     pub capacity_loss_ah_per_ah: f64,
-    /// Resistance gained at the end of each cycle, relative to new.
+    /// Resistance gained at the end of each cycle, relative to a new cell.
     pub resistance_growth_per_cycle: f64,
-    /// Resistance gained per Ah moved in either direction, relative to new.
+    /// Resistance gained per Ah moved in either direction, relative to a new cell.
     pub resistance_growth_per_ah: f64,
 }
 
@@ -54,18 +53,18 @@ pub struct Spread {
     pub capacity: f64,
     /// Relative standard deviation of the resistance.
     pub resistance: f64,
-    /// Standard deviation of the SOC at the start, fraction.
+    /// Standard deviation of the SOC at the start (fraction).
     pub soc: f64,
 }
 
-/// Settings of a pack. Its cells are in series, and equal except for their spread.
+/// Settings of a pack with cells in series.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PackSettings {
     /// Number of cells in series, at least 1.
     pub cells: u16,
     /// Capacity of a new cell (Ah).
     pub capacity_ah: f64,
-    /// SOC at the start, fraction.
+    /// SOC at the start (fraction).
     pub initial_soc: f64,
     /// Differences between the cells.
     pub spread: Spread,
@@ -79,13 +78,13 @@ pub struct PackSettings {
     pub ambient_c: f64,
 }
 
-/// The spread is clipped at this many standard deviations, so that no cell is an extreme outlier.
+/// Differences between cells are clipped at this many standard deviations, so that no cell is an extreme outlier.
 const SPREAD_LIMIT: f64 = 3.0;
 
 /// True state of one cell.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TruthCell {
-    /// State of charge, fraction.
+    /// State of charge (fraction).
     pub soc: f64,
     /// Voltages of the model's RC branches (V); 0 in unused elements.
     pub branch_v: [f64; MAX_BRANCHES],
@@ -103,8 +102,8 @@ pub struct TruthCell {
     pub leak: Option<Leak>,
     /// Current of the balancing resistor (A); 0 = off.
     pub bleed_a: f64,
-    /// Contact resistance of an injected fault (ohm). It lies between the cell's voltage taps but outside the cell, so
-    /// `voltage_v` does not include its voltage drop.
+    /// Contact resistance of an injected fault (ohm). It lies between the cell's voltage taps. `voltage_v` does not
+    /// include its voltage drop.
     pub contact_ohm: f64,
     floor_ah: f64,
 }
@@ -112,7 +111,7 @@ pub struct TruthCell {
 impl TruthCell {
     fn new(settings: &PackSettings, noise: &mut Noise) -> Self {
         let mut spread = |std: f64| std * noise.normal().clamp(-SPREAD_LIMIT, SPREAD_LIMIT);
-        // Lower limit of the capacity, because the SOC is a charge divided by the capacity: 1 % of the new capacity.
+        // The capacity stays above 1 % of the new capacity, because the SOC is a charge divided by the capacity.
         let floor_ah = settings.capacity_ah * 0.01;
         Self {
             capacity_ah: (settings.capacity_ah * (1.0 + spread(settings.spread.capacity))).max(floor_ah),
@@ -141,8 +140,7 @@ impl TruthCell {
         (self.unloaded_v(model, hysteresis) - voltage_v) / (model.r0_ohm(&place) * self.resistance_ratio)
     }
 
-    /// Current of the injected leak (A). The leak stops when the cell is empty. The voltage drop that the leak causes
-    /// is neglected.
+    /// Current of the injected leak (A); 0 once the cell is empty. The voltage drop that the leak causes is neglected.
     pub fn leak_a(&self, model: &CellModel, hysteresis: &Hysteresis) -> f64 {
         match self.leak {
             None => 0.0,
@@ -206,7 +204,7 @@ pub struct Pack {
 }
 
 impl Pack {
-    /// Creates a pack at rest, with the spread of its cells drawn from `seed`.
+    /// Creates a pack at rest. `seed` determines the differences between its cells.
     pub fn new(model: CellModel, settings: PackSettings, seed: u64) -> Self {
         assert!(settings.cells > 0, "a pack has at least one cell");
         let mut noise = Noise::new(seed, Stream::Spread);
@@ -221,7 +219,7 @@ impl Pack {
         }
     }
 
-    /// Completes a cycle: applies the ageing per cycle.
+    /// Completes a cycle and applies the ageing per cycle.
     pub fn complete_cycle(&mut self) {
         self.cycles += 1;
         let ageing = self.settings.ageing;
@@ -230,7 +228,7 @@ impl Pack {
         }
     }
 
-    /// Changes the ageing of the following steps, to simulate fade that is not linear.
+    /// Changes the ageing from the next step on, which makes fade that is not linear possible.
     pub fn set_ageing(&mut self, ageing: Ageing) {
         self.settings.ageing = ageing;
     }
@@ -240,13 +238,12 @@ impl Pack {
         self.settings.ambient_c = ambient_c;
     }
 
-    /// Starts a fault of a cell, a contact or a module; a fault of a sensor does not change the true state.
+    /// Starts a fault of a cell, a contact or a module. A fault of a sensor does not change the true state.
     pub(crate) fn begin_fault(&mut self, fault: FaultKind) {
         match fault {
             FaultKind::Leak { cell, leak } => self.cells[cell.index()].leak = Some(leak),
             FaultKind::Contact { cell, resistance } => {
-                // A relative contact resistance refers to the cell's resistance at this SOC and temperature (degrees
-                // C).
+                // A share refers to the cell's resistance at this SOC and temperature (degrees C).
                 let place = self.model.grid_position(0.5, 25.0);
                 let cell = &mut self.cells[cell.index()];
                 cell.contact_ohm += match resistance {
@@ -277,7 +274,6 @@ impl Pack {
         }
     }
 
-    /// Sets the current of each cell's balancing resistor (A).
     pub(crate) fn set_bleeds(&mut self, mut bleed_a: impl FnMut(usize, &TruthCell) -> f64) {
         for (i, cell) in self.cells.iter_mut().enumerate() {
             cell.bleed_a = bleed_a(i, cell);
@@ -309,22 +305,22 @@ impl Pack {
         &self.model
     }
 
-    /// Terminal voltage of each cell while `current_a` flows (V).
+    /// Terminal voltage of each cell (V) while `current_a` flows.
     pub fn voltages_v(&self, current_a: f64) -> impl Iterator<Item = f64> + '_ {
         self.cells.iter().map(move |cell| cell.voltage_v(&self.model, &self.settings.hysteresis, current_a))
     }
 
-    /// Lowest cell voltage while `current_a` flows (V).
+    /// Lowest cell voltage (V) while `current_a` flows.
     pub fn lowest_v(&self, current_a: f64) -> f64 {
         self.voltages_v(current_a).fold(f64::INFINITY, f64::min)
     }
 
-    /// Highest cell voltage while `current_a` flows (V).
+    /// Highest cell voltage (V) while `current_a` flows.
     pub fn highest_v(&self, current_a: f64) -> f64 {
         self.voltages_v(current_a).fold(f64::NEG_INFINITY, f64::max)
     }
 
-    /// Lowest and highest cell voltage while `current_a` flows (V).
+    /// Lowest and highest cell voltage (V) while `current_a` flows.
     pub fn extremes_v(&self, current_a: f64) -> (f64, f64) {
         let widen = |(low_v, high_v): (f64, f64), voltage_v| (low_v.min(voltage_v), high_v.max(voltage_v));
         self.voltages_v(current_a).fold((f64::INFINITY, f64::NEG_INFINITY), widen)
@@ -346,7 +342,7 @@ impl Pack {
         self.cells.iter().map(|cell| cell.soc).fold(f64::NEG_INFINITY, f64::max)
     }
 
-    /// Capacity of the weakest cell (Ah).
+    /// Lowest capacity of a cell (Ah).
     pub fn lowest_capacity_ah(&self) -> f64 {
         self.cells.iter().map(|cell| cell.capacity_ah).fold(f64::INFINITY, f64::min)
     }

@@ -1,17 +1,16 @@
 //! Commissioning: finds probable faults in the wiring or the configuration of a pack on a bus.
 //!
-//! In: a [`Plan`] (the readable parts of the configuration), every frame of every interface with its time, interface
-//! events, and the estimates of a [`Monitor`](crate::monitor::Monitor) if the configuration allows one. Out: a
+//! In: a [`Plan`] (the readable parts of the configuration), every frame of every interface with its time, and
+//! interface events. If the configuration allows a [`Monitor`](crate::monitor::Monitor), also its estimates. Out: a
 //! [`WiringReport`] with findings (each with evidence, reason and the line to change), checks that passed, and checks
-//! that were not possible. The observer has its own decoder, which applies no limits to readings. The observer
-//! therefore also works with a configuration that the estimator cannot use. The observer's memory use is bounded for
-//! any duration.
+//! that were not possible. The observer has its own decoder without limits for readings. It therefore also works with
+//! a configuration that the estimator cannot use. Its memory use is bounded.
 //!
 //! | file | purpose |
 //! | --- | --- |
 //! | `plan` | expected interfaces, messages and signals |
-//! | [`evidence`] | evidence about signals from values, names and bits; `discover` also scores its candidates with this evidence |
-//! | `other_current` | statistics of a message that arrives on another interface but has the identifier of the current's message |
+//! | [`evidence`] | evidence about signals from values, names and bits; also used by `discover` |
+//! | `other_current` | statistics of the message with the pack current, if it also arrives on another interface |
 //! | `observer` | [`WiringObserver`]: collects frames, events and estimates |
 //! | `judge` | turns everything received into a [`WiringReport`] |
 //! | `report` | findings with their evidence, and the lines to change |

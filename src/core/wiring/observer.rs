@@ -17,7 +17,6 @@ use crate::can::{CanId, Frame, FrameKind};
 use crate::monitor::{BusEvent, Estimate};
 use crate::quantity::{BusIndex, Channel, Timestamp};
 
-/// Statistics of the frames with one identifier on one interface.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct IdStats {
     pub(crate) count: u64,
@@ -27,7 +26,6 @@ pub(crate) struct IdStats {
     pub(crate) len: usize,
 }
 
-/// Statistics and state of one interface.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct BusStats {
     pub(crate) name: String,
@@ -40,7 +38,6 @@ pub(crate) struct BusStats {
     pub(crate) is_down: bool,
 }
 
-/// Results of the end-to-end checks of one protected message.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct ProtectionStats {
     pub(crate) counts: BTreeMap<&'static str, u64>,
@@ -49,7 +46,6 @@ pub(crate) struct ProtectionStats {
     pub(crate) payloads: Vec<Vec<u8>>,
 }
 
-/// Statistics of the estimator's results.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct EstimatorStats {
     pub(crate) estimates: u64,
@@ -70,7 +66,6 @@ impl Hole {
     }
 }
 
-/// Selects one of the plan's lists of signals.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum SignalList {
     Configured,
@@ -83,11 +78,8 @@ enum SignalList {
 pub struct WiringObserver {
     pub(crate) plan: Plan,
     pub(crate) buses: Vec<BusStats>,
-    /// Evidence of each signal, in the order of `plan.signals`.
     pub(crate) series: Vec<Series>,
-    /// Evidence of each signal, in the order of `plan.more_cells`.
     pub(crate) more_cells: Vec<Series>,
-    /// Evidence of each signal, in the order of `plan.unconfigured`.
     pub(crate) unconfigured: Vec<Series>,
     /// Indexes of the signals in each message.
     by_id: BTreeMap<(BusIndex, CanId), Vec<(SignalList, usize)>>,
@@ -95,8 +87,7 @@ pub struct WiringObserver {
     listener: Listener,
     /// Indexes of the signals in the answer to each diagnostic question.
     by_question: BTreeMap<Question, Vec<(SignalList, usize)>>,
-    /// For each other interface that carries the identifier of the configured current's message: statistics of the
-    /// message.
+    /// Statistics of the message with the pack current, for each other interface on which its identifier arrives.
     pub(crate) other_currents: BTreeMap<BusIndex, OtherCurrent>,
     /// Messages that any J1939 source address may send.
     groups: ParameterGroups,
@@ -106,21 +97,17 @@ pub struct WiringObserver {
     direction: Option<(Timestamp, Option<f64>)>,
     guards: Guards,
     pub(crate) protected: BTreeMap<(BusIndex, CanId), ProtectionStats>,
-    /// Voltage responses over short and long blocks.
     responses: [VoltageResponse; 2],
     pub(crate) estimator: EstimatorStats,
-    /// Current, charge, voltage and reported values at the same times.
     pub(crate) usage: UsageRecord,
     /// Signals of the reported values in `usage`, in order.
     pub(super) witnesses: Vec<Witness>,
     /// The longest holes, and the number of all holes.
     pub(crate) holes: Vec<Hole>,
     pub(crate) hole_count: usize,
-    /// Time of the first frame.
     pub(crate) first: Option<Timestamp>,
-    /// Time of the latest frame.
     pub(crate) latest: Option<Timestamp>,
-    /// Sum of the times between frames (s). Gaps above 30 s are left out, because the buses sleep during these gaps.
+    /// Sum of the times between frames (s). Gaps above 30 s are left out, because the buses sleep during such a gap.
     pub(crate) awake_s: f64,
     /// Time listened on live interfaces (s); `None` for a recording, which uses `awake_s` instead.
     listened_s: Option<f64>,
@@ -213,8 +200,8 @@ impl WiringObserver {
         }
     }
 
-    /// If the frame has the identifier of the configured current's message but arrives on another interface, reads the
-    /// current from the frame.
+    /// If the frame has the identifier of the message with the pack current but arrives on another interface, reads
+    /// the current from the frame.
     fn read_other_current(&mut self, time: Timestamp, bus: BusIndex, frame: &Frame) {
         let is_current = |signal: &&SignalPlan| signal.binding.channel == Channel::Current;
         let Some(signal) = self.plan.signals.iter().find(is_current) else { return };
@@ -245,7 +232,6 @@ impl WiringObserver {
         self.by_id.insert(key, signals);
     }
 
-    /// If the frame completes a diagnostic answer, reads the signals of the answer.
     fn read_answer(&mut self, time: Timestamp, bus: BusIndex, frame: &Frame) {
         self.listener.losses.clear();
         let FrameOutcome::Whole { answer, data, .. } = self.listener.handle(time, bus, frame) else { return };
@@ -255,7 +241,6 @@ impl WiringObserver {
         self.by_question.insert(question, signals);
     }
 
-    /// Reads signals of a frame's payload or of an answer's data.
     fn read_signals(&mut self, time: Timestamp, wanted: &[(SignalList, usize)], data: &[u8]) {
         let Self {
             plan, series, more_cells, unconfigured, responses, other_currents, usage, witnesses, direction, ..
@@ -312,13 +297,11 @@ impl WiringObserver {
         }
     }
 
-    /// Ends the open blocks and steady runs.
     pub(super) fn end_blocks(&mut self) {
         self.responses.iter_mut().for_each(VoltageResponse::pause);
         self.other_currents.values_mut().for_each(OtherCurrent::pause);
     }
 
-    /// The voltage response over short blocks.
     pub(super) fn fast_response(&self) -> &VoltageResponse {
         &self.responses[0]
     }
@@ -328,17 +311,14 @@ impl WiringObserver {
         best_response(&self.responses).slope()
     }
 
-    /// Slope of one cell's voltage against the current, with the block length that [`Self::slope`] uses.
     pub(super) fn slope_of(&self, cell: usize) -> Option<Slope> {
         best_response(&self.responses).slope_of(cell)
     }
 
-    /// The block length used for [`Self::slope`], s.
     pub(super) fn slope_block_s(&self) -> f64 {
         best_response(&self.responses).block_s()
     }
 
-    /// The responses over short and long blocks.
     pub(super) fn responses(&self) -> &[VoltageResponse; 2] {
         &self.responses
     }

@@ -17,8 +17,7 @@ pub struct Plan {
     pub interfaces: Vec<InterfacePlan>,
     /// Configured signals that were found in a DBC.
     pub signals: Vec<SignalPlan>,
-    /// Signals of the DBC that look like voltages of cells beyond `pack.cells`, in the order of the cell
-    /// numbers.
+    /// Signals of the DBC that look like voltages of cells beyond `pack.cells`, ordered by cell number.
     pub more_cells: Vec<SignalPlan>,
     /// Signals of the DBC that are not configured but look like the pack's voltage (if cell voltages are configured) or
     /// a state of charge. The binding of each entry names the channel that the signal probably carries. A signal has
@@ -53,7 +52,8 @@ pub struct PackPlan {
     pub strings: u16,
     /// The cell model; `None` if it cannot be read.
     pub model: Option<CellModel>,
-    /// The label of the cell, if the model comes from a label; `None` if the model comes from a file.
+    /// The label of the cell (chemistry and capacity), if the model is derived from it; `None` if the model comes
+    /// from a file.
     pub label: Option<Label>,
     /// Capacity of a cell (Ah). If no capacity is configured, the capacity of the model applies.
     pub capacity_ah: f64,
@@ -61,7 +61,7 @@ pub struct PackPlan {
     pub ambient_c: f64,
     /// Largest absolute current at which the pack counts as resting (A).
     pub dead_band_a: f64,
-    /// White noise that the estimator assumes in a voltage reading (standard deviation) (V).
+    /// Standard deviation of the white noise that the estimator assumes in a voltage reading (V).
     pub voltage_noise_v: f64,
 }
 
@@ -129,13 +129,11 @@ impl PackPlan {
 }
 
 impl SignalPlan {
-    /// The signal's name and unit.
     pub(super) fn label(&self) -> SignalLabel {
         let name = self.name.rsplit_once('.').map_or(self.name.as_str(), |(_, name)| name);
         SignalLabel::new(&self.message, name, &self.unit)
     }
 
-    /// Whether this signal and `other` share bits.
     pub(super) fn shares_bits(&self, other: &Self) -> bool {
         let (a, b) = (&self.binding, &other.binding);
         let is_together = (a.bus, a.id, &a.mux) == (b.bus, b.id, &b.mux);
@@ -193,7 +191,6 @@ pub struct OutputPlan {
     pub table: String,
 }
 
-/// Kinds of quantities that the checks distinguish.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum Kind {
     Current,
@@ -251,7 +248,6 @@ impl Plan {
         all
     }
 
-    /// The signal of a witness.
     pub(super) fn witness(&self, Witness { is_configured, index }: Witness) -> &SignalPlan {
         if is_configured { &self.signals[index] } else { &self.unconfigured[index] }
     }
@@ -261,7 +257,7 @@ impl Plan {
         self.signals.iter().any(|signal| signal.binding.channel == Channel::CurrentDirection)
     }
 
-    /// Age from which a reading of the channel is stale (s).
+    /// Maximum age of a reading of the channel (s).
     pub(super) fn max_age_s(&self, channel: Channel) -> f64 {
         self.max_ages_s.get(Kind::of(channel) as usize).copied().flatten().unwrap_or(f64::INFINITY)
     }

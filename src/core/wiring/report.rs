@@ -80,7 +80,8 @@ pub struct Change {
     pub place: Option<String>,
     /// Present value in the file; `None` if the key is not set.
     pub now: Option<String>,
-    /// Whether this change replaces the changes before it in the list, because only one of them is right.
+    /// Whether this change is an alternative to the changes before it in the list. Only one of the alternatives is
+    /// right.
     pub is_alternative: bool,
 }
 
@@ -101,7 +102,7 @@ pub struct WiringFinding {
     pub changes: Vec<Change>,
     /// Further advice, or the only advice if no change of the configuration helps.
     pub advice: Option<String>,
-    /// Whether the changes remove this finding, if the same input was judged again with them; `None` = not tried.
+    /// Whether the finding disappears if the same input is judged again with the changes; `None` = not tried.
     pub is_solved: Option<bool>,
     /// Titles of findings that are probably consequences of this finding and are not listed separately.
     pub consequences: Vec<String>,
@@ -146,7 +147,7 @@ impl WiringFinding {
         self
     }
 
-    /// Adds a change that replaces the changes before it.
+    /// Adds a change that is an alternative to the changes before it.
     pub(super) fn alternative(&mut self, table: &str, key: &str, proposed: impl Into<String>) -> &mut Self {
         let is_alternative = !self.changes.is_empty();
         let (table, key) = (table.to_owned(), key.to_owned());

@@ -1,4 +1,4 @@
-//! The stream of objects inside the containers of a BLF file.
+//! Reads the stream of objects inside the containers of a BLF file.
 
 use std::io::{self, Read};
 
@@ -17,23 +17,24 @@ const MAX_CONTENT: u32 = 64 << 20;
 /// How the current part of the file becomes content.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Packing {
-    /// Between two outer objects.
+    /// The position is between two outer objects.
     Between,
-    /// The bytes themselves.
+    /// The bytes are stored without compression.
     Stored,
-    /// zlib.
+    /// The bytes are compressed with zlib.
     Deflated,
 }
 
 /// Reads the content of the containers, and outer objects without a container, one after another.
 ///
-/// Returns an error of the kind `InvalidData` for a damaged container and continues with the next one.
+/// For a damaged container, returns an error of the kind `InvalidData`. The next call continues with the next
+/// container.
 pub(super) struct Containers {
     file: ByteStream<Box<dyn Read>>,
     packing: Packing,
     /// Bytes of the current part that are still in the file.
     left: u64,
-    /// Bytes of content that the current container still states.
+    /// Bytes of content that remain according to the current container.
     content_left: u64,
     inflate: Decompress,
     /// Offset in the file of the current outer object.
@@ -41,7 +42,7 @@ pub(super) struct Containers {
 }
 
 impl Containers {
-    /// `file` is after the header.
+    /// Creates a reader. `file` must be positioned after the file's header.
     pub(super) fn new(file: ByteStream<Box<dyn Read>>) -> Self {
         let at = file.offset();
         Self { file, packing: Packing::Between, left: 0, content_left: 0, inflate: Decompress::new(true), at }
@@ -140,7 +141,7 @@ impl Containers {
             let [used, made] = [self.inflate.total_in() - before.0, self.inflate.total_out() - before.1];
             self.file.consume(used as usize);
             self.left -= used;
-            // Bytes before damage are good. The next call returns the error again.
+            // Bytes before damage are valid, so they are returned first. The next call returns the error.
             if made > 0 || limit == 0 {
                 return Ok(made as usize);
             }

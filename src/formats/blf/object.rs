@@ -1,4 +1,4 @@
-//! Objects of a BLF file that belong to a CAN bus.
+//! Decodes the objects of a BLF file that belong to a CAN bus.
 
 use packwatch_core::can::Frame;
 
@@ -16,10 +16,11 @@ const CAN_FD_MESSAGE: u32 = 100;
 const CAN_FD_MESSAGE_64: u32 = 101;
 const CAN_FD_ERROR_64: u32 = 104;
 
-/// Objects of a CAN bus that are longer must be damaged, bytes. The longest known one has about 200 bytes.
+/// Maximum size of an object of a CAN bus, bytes. A longer object must be damaged, because the longest known object has
+/// about 200 bytes.
 pub(super) const MAX_CAN_OBJECT: usize = 4096;
 
-/// Mark of a 29-bit identifier.
+/// Flag of a 29-bit identifier.
 const EXTENDED: u32 = 1 << 31;
 /// CAN_ERR_PROT of SocketCAN: a violation of the protocol, seen by the controller.
 const PROTOCOL_ERROR: u32 = 8;
@@ -106,7 +107,7 @@ fn fd_64(body: &[u8], header: usize) -> Result<Frame, String> {
     if flags & 0x10 != 0 {
         return raw(id, true, None, &[0; 8][..length_of_code(code, false)]).check();
     }
-    // Further fields may follow the payload. Their place counts from the start of the object.
+    // Further fields may follow the payload. Their position counts from the start of the object.
     let end = match usize::from(body[35]) {
         0 => body.len(),
         place => place.saturating_sub(header).min(body.len()),

@@ -118,7 +118,7 @@ fn bytes_that_are_not_stored_are_zero() {
     body.extend(0x3000_u32.to_le_bytes());
     body.resize(40, 0);
     body.extend([7; 48]);
-    // With the place of further fields behind the payload, and without it.
+    // The first object does not state the position of further fields behind the payload, the second does.
     let place = 32 + body.len() as u8;
     let further = [&body[..35], &[place], &body[36..], &[9; 8]].concat();
     for body in [body, further] {

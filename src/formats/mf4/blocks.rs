@@ -1,4 +1,4 @@
-//! Blocks of an MDF file: a head with an identifier, a length and links, then data.
+//! Reads the blocks of an MDF file. A block has a head with an identifier, a length and links, and then data.
 
 use std::fs::File;
 use std::io;
@@ -10,7 +10,8 @@ use crate::byte_stream::{cut, damaged, u16_at, u64_at};
 pub(super) const FIRST_BLOCK: u64 = 64;
 /// Size of a block's head, bytes.
 pub(super) const BLOCK_HEAD: u64 = 24;
-/// Longest data of a block that describes something, bytes. Such blocks have less than 1 KiB without their texts.
+/// Maximum number of data bytes that are read of a describing block. Such blocks have less than 1 KiB without their
+/// texts.
 const MAX_DESCRIPTION: u64 = 4096;
 
 /// An MDF file and its first 64 bytes.
@@ -129,7 +130,7 @@ impl MdfFile {
         Ok(u64::from_le_bytes(link))
     }
 
-    /// Reads the data of a block that describes something, at least `needed` bytes.
+    /// Reads the data of a describing block, at least `needed` bytes.
     pub(super) fn description(&self, block: &Block, needed: usize) -> io::Result<Vec<u8>> {
         let mut data = vec![0; usize::try_from(block.data_len().min(MAX_DESCRIPTION)).unwrap_or(0)];
         let read = self.read(block.data_address(), &mut data)?;
@@ -141,7 +142,7 @@ impl MdfFile {
         Ok(data)
     }
 
-    /// The text of a text block, or of a metadata block as far as it is kept here; empty without a link.
+    /// The text of a text block or metadata block, cut after 4096 bytes; empty if `address` is 0.
     pub(super) fn text(&self, address: u64) -> io::Result<String> {
         if address == 0 {
             return Ok(String::new());

@@ -1,4 +1,4 @@
-//! The data of a group: one block or a list of blocks, compressed or not, read as one stream of bytes.
+//! Reads the data of a group as one stream of bytes. The data are one block or a list of blocks, compressed or not.
 
 use std::io::{self, BufReader, Read};
 use std::rc::Rc;
@@ -8,27 +8,24 @@ use flate2::bufread::ZlibDecoder;
 use super::blocks::{BLOCK_HEAD, Block, MdfFile};
 use crate::byte_stream::{cut, damaged, u32_at, u64_at};
 
-/// Identifiers of blocks with data.
 const DATA: [&[u8; 4]; 6] = [b"##DT", b"##DV", b"##SD", b"##DI", b"##RD", b"##DZ"];
-/// Identifiers of lists of blocks.
 const LISTS: [&[u8; 4]; 2] = [b"##DL", b"##LD"];
-/// Largest block that is transposed, bytes unpacked: it is held as a whole. The standard allows 4 MiB.
+/// Maximum unpacked size of a transposed block, bytes. Such a block is held in memory as a whole. The standard allows 4
+/// MiB.
 const MAX_TRANSPOSED: u64 = 32 << 20;
 /// Buffer for compressed bytes, bytes.
 const PACKED_BUFFER: usize = 32 * 1024;
 
-/// Reads the blocks of one link as one stream.
 pub(super) struct DataBlocks {
     file: Rc<MdfFile>,
     list: List,
     body: Body,
     /// Address of the current block.
     at: u64,
-    /// Bytes of blocks that may still be read: blocks cannot be longer than the file.
+    /// Bytes of blocks that may still be read. All blocks together cannot be longer than the file.
     left_in_file: u64,
 }
 
-/// The blocks that follow.
 enum List {
     End,
     /// A single block.
@@ -36,7 +33,7 @@ enum List {
     /// A list: its current part, the next link in it, and the number of parts that may still follow.
     Part {
         part: Block,
-        /// Number of links to data, and the link read last; link 0 leads to the next part.
+        /// Number of links to data, and number of the link read last. Link 0 leads to the next part.
         links: u64,
         index: u64,
         parts_left: u64,
@@ -44,7 +41,6 @@ enum List {
     },
 }
 
-/// The unread content of the current block.
 enum Body {
     Empty,
     Stored(Section),
@@ -52,7 +48,6 @@ enum Body {
     Transposed(Transposed),
 }
 
-/// A part of the file.
 struct Section {
     file: Rc<MdfFile>,
     at: u64,
@@ -72,7 +67,6 @@ impl DataBlocks {
         Ok(Self { file: Rc::clone(file), list, body: Body::Empty, at: link, left_in_file })
     }
 
-    /// Address of the current block.
     pub(super) fn position(&self) -> u64 {
         self.at
     }
@@ -214,7 +208,7 @@ impl Transposed {
             self.next += out.len();
             return out.len();
         }
-        // Records that are longer than the buffer, and bytes after the last record.
+        // The remaining bytes: records that are longer than the buffer, and bytes after the last record.
         for (byte, at) in out[..count].iter_mut().zip(self.next..) {
             let is_in_record = at < columns * rows;
             *byte = self.bytes[if is_in_record { at % columns * rows + at / columns } else { at }];

@@ -1,4 +1,4 @@
-//! Events of a CAN bus: the fields of their records, and the frames that follow.
+//! Decodes the records of CAN bus events, and turns them into frames and error frames.
 
 use packwatch_core::quantity::Timestamp;
 
@@ -6,15 +6,14 @@ use super::field::Field;
 use crate::Item;
 use crate::raw_frame::{RawFrame, length_of_code};
 
-/// Mark of a 29-bit identifier, if the record has no field for it.
+/// Flag of a 29-bit identifier, if the record has no field for it.
 const EXTENDED: u64 = 1 << 31;
-/// Identifier without marks.
+/// Identifier without flags.
 const ID_BITS: u64 = 0x1FFF_FFFF;
 /// Classes of errors in SocketCAN: violation of the protocol, no acknowledgement.
 const PROTOCOL_ERROR: u32 = 8;
 const NO_ACKNOWLEDGEMENT: u32 = 0x20;
 
-/// Kind of an event.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum EventKind {
     Data,
@@ -115,7 +114,7 @@ impl Event {
         let fd = is_fd.then(|| (is_set(self.brs), is_set(self.esi)));
         let id = (id & ID_BITS) as u32;
         if remote {
-            // Some writers state the requested length as the code only, and a length of 0.
+            // Some writers state the requested length only as the code, and state a data length of 0.
             let len = code.or(stated).unwrap_or(0).min(8);
             return Ok(RawFrame { id, extended, remote, fd: None, data: &[0; 8][..len] });
         }

@@ -1,4 +1,4 @@
-//! Numbers in a record.
+//! Decodes the numbers in a record.
 
 use std::io;
 
@@ -41,7 +41,6 @@ pub(super) struct Field {
     factor: f64,
 }
 
-/// Fields of a channel block.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct ChannelBlock {
     pub(super) kind: u8,
@@ -76,8 +75,9 @@ impl Field {
         };
         let big_endian = channel.data_type < FIRST_OTHER && channel.data_type & 1 != 0;
         let (byte, shift, bits) = (channel.byte as usize, u32::from(channel.bit), channel.bits);
-        // The number of a virtual channel is the record's index. With factor 0, as usual for the fields of a bus, the
-        // value is constant; converters keep the factor when they store the index.
+        // The number of a virtual channel is the record's index. If the factor is 0, as usual for the fields of a bus,
+        // the value is constant. A converter that stores the index keeps the factor, so the value is constant there
+        // too.
         if factor == 0.0 || matches!(channel.kind, VIRTUAL_MASTER | VIRTUAL) {
             let constant = offset.clamp(0.0, f64::from(u32::MAX)) as u64;
             let number = NumberType::Unsigned;
@@ -127,7 +127,7 @@ impl Field {
         self.bytes == 0 || (self.offset == 0.0 && self.factor == 1.0)
     }
 
-    /// The value as seconds, in nanoseconds, rounded.
+    /// Interprets the value as seconds. Returns rounded nanoseconds.
     #[inline]
     pub(super) fn nanos(&self, record: &[u8]) -> i64 {
         let bits = self.number(record);

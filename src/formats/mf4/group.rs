@@ -13,7 +13,7 @@ use crate::Item;
 use crate::byte_stream::{ByteStream, cut, damaged, u32_at};
 use crate::channel_list::ChannelList;
 
-/// Number of records whose channel is looked at before the channels are numbered.
+/// Number of records in which the lowest channel is searched before the channels are numbered.
 const CHANNEL_RECORDS: usize = 1000;
 
 /// An item with the time by which groups are merged.
@@ -22,13 +22,12 @@ pub(super) struct Stamped {
     pub(super) item: Item,
 }
 
-/// Reads the records of one data group.
 pub(super) struct GroupReader {
     file: Rc<MdfFile>,
     stream: ByteStream<DataBlocks>,
     id_len: usize,
     records: Vec<RecordGroup>,
-    /// Payloads outside of the records, by the index of the record group whose records need them.
+    /// For each record group, where the payloads outside of its records are.
     outside: Vec<Outside>,
     /// Records left of sorted data; `None` = unknown.
     left: Option<u64>,
@@ -42,7 +41,7 @@ pub(super) struct GroupReader {
 
 /// Payloads outside of the records of a group.
 enum Outside {
-    /// The records need none.
+    /// The records contain all their data.
     None,
     Signal(SignalValues),
     /// Records of the group with this index.
@@ -211,7 +210,7 @@ impl GroupReader {
         Ok(())
     }
 
-    /// At the end, no record may wait for its payload.
+    /// Fails if a record still waits for its payload at the end.
     fn check_waiting(&self) -> io::Result<()> {
         let waiting = |outside: &Outside| match outside {
             Outside::Group(_, values) => values.waiting_records(),
@@ -224,8 +223,8 @@ impl GroupReader {
     }
 }
 
-/// Index of the next record's group, and length of the record with its number (of a value: with its length). `None` at
-/// the end.
+/// Index of the next record's group, and length of the record including its number. For a value of variable length,
+/// this is the length of its number and its length field. `None` at the end.
 #[inline]
 fn record_of(
     records: &[RecordGroup],

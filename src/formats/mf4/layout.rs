@@ -1,4 +1,4 @@
-//! The description of an MF4 file: which groups have frames of a CAN bus, and where the fields of their records are.
+//! Reads the description of an MF4 file: which groups have CAN frames, and where the fields of their records are.
 
 use std::collections::HashSet;
 use std::io;
@@ -15,16 +15,15 @@ const MAX_BLOCKS: usize = 200_000;
 const MAX_OPEN_GROUPS: usize = 128;
 /// Number of channel names in the message about a file without frames.
 const MAX_NAMES: usize = 5;
-/// Group whose records are variable-length values of another group.
+/// Flag of a group whose records are variable-length values of another group.
 const VARIABLE_LENGTH: u16 = 1;
-/// Types of a channel: a value of variable length; the master.
+/// Types of a channel: value of variable length, master, virtual master.
 const VARIABLE: u8 = 1;
 const MASTER: u8 = 2;
 const VIRTUAL_MASTER: u8 = 3;
 /// Synchronisation of a master channel: time.
 const TIME: u8 = 1;
 
-/// Description of a file.
 pub(super) struct Layout {
     pub(super) groups: Vec<DataGroup>,
     /// Groups that cannot be read.
@@ -36,18 +35,16 @@ pub(super) struct Layout {
 /// Groups that share their data.
 pub(super) struct DataGroup {
     pub(super) file: Rc<MdfFile>,
-    /// Link to the data.
     pub(super) data: u64,
     /// Size of the number before each record, bytes; 0 = sorted data of one group.
     pub(super) id_len: usize,
-    /// By record number.
+    /// Sorted by the number before each record.
     pub(super) records: Vec<RecordGroup>,
 }
 
 /// A group of records.
 pub(super) struct RecordGroup {
     pub(super) id: u64,
-    /// Address of the group's block.
     pub(super) address: u64,
     /// Length of a record, bytes.
     pub(super) len: usize,
@@ -56,7 +53,7 @@ pub(super) struct RecordGroup {
     pub(super) content: Content,
 }
 
-/// What the records of a group are.
+/// What the records of a group contain.
 pub(super) enum Content {
     Event(Box<Event>),
     /// Variable-length values.
@@ -85,18 +82,16 @@ pub(super) fn read(file: Rc<MdfFile>) -> io::Result<Layout> {
     Ok(Layout { groups, notes: scan.notes, damage })
 }
 
-/// State while the description is read.
 struct Scan {
     file: Rc<MdfFile>,
     start_ns: i64,
-    /// Addresses of all blocks read: a block that is linked twice would make a circle.
+    /// Addresses of all blocks read. If a block is linked twice, the links form a circle.
     visited: HashSet<u64>,
-    /// First channels of groups without frames.
+    /// Names of the first channels of groups without frames.
     names: Vec<String>,
     notes: Vec<String>,
 }
 
-/// Channels of a group.
 #[derive(Default)]
 struct Channels {
     time: Option<ChannelBlock>,
@@ -225,7 +220,7 @@ impl Scan {
             id,
             extended: plain("IDE")?,
             code: plain("DLC")?,
-            // A table of lengths is that of the codes.
+            // Ignored if a table converts it: the stored number is then the length code, which DLC states too.
             len: plain("DataLength")?,
             channel: plain("BusChannel")?,
             is_fd: plain("EDL")?,

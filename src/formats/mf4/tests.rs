@@ -71,7 +71,8 @@ impl Unsorted {
         self.block(b"##CG", &[next, first, 0, 0, 0, 0], &data)
     }
 
-    /// The description: frames are group 1, payloads group 2. `list` makes the data a list that contains itself.
+    /// Writes the description: frames are group 1, payloads group 2. If `is_circular` is true, the data are a list that
+    /// links to itself.
     fn new(is_circular: bool) -> Self {
         let mut file = Self { bytes: b"UnFinMF 4.11    test    ".to_vec(), values: 0 };
         file.bytes.resize(60, 0);

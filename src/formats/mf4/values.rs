@@ -1,4 +1,4 @@
-//! Payloads outside of the records: values of variable length, each preceded by its length.
+//! Reads payloads outside of the records: values of variable length, each preceded by its length.
 
 use std::collections::VecDeque;
 use std::io::{self, Read};
@@ -32,7 +32,7 @@ impl SignalValues {
         Ok(Self { file: Rc::clone(file), link, stream, restarts: 0 })
     }
 
-    /// The value at an offset; the inner error is a value that no frame can have.
+    /// Returns the value at an offset. The inner error means that the value is longer than any payload of a frame.
     ///
     /// # Errors
     /// Fails if the data cannot be read or end before the value.
@@ -85,7 +85,8 @@ impl Value {
 }
 
 impl ValueGroup {
-    /// `has_offsets`: whether the records state valid offsets. Otherwise the order counts.
+    /// If `has_offsets` is true, the records state valid offsets. Otherwise values and records are matched by their
+    /// order.
     pub(super) fn new(has_offsets: bool) -> Self {
         let current = Value { offset: 0, len: 0, bytes: [0; MAX_VALUE] };
         Self { has_offsets, end: 0, values: VecDeque::new(), records: VecDeque::new(), current }

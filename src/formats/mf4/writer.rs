@@ -59,7 +59,6 @@ pub struct Mf4Writer<W> {
     groups: [Group; 4],
 }
 
-/// A group of records with the same fields.
 struct Group {
     event: &'static str,
     fields: Vec<(&'static str, usize)>,

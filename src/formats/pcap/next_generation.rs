@@ -1,4 +1,5 @@
-//! PCAPNG: blocks with their length, sections with their own byte order, interfaces with names and time units.
+//! Reads PCAPNG files. A file has blocks with their length, sections with their own byte order, and interfaces with
+//! names and time units.
 
 use std::io::{self, Read};
 
@@ -11,7 +12,6 @@ use crate::{Channel, Item, LogReader, Position, Source};
 /// First bytes of a section, the same in both byte orders.
 pub(crate) const SECTION_HEADER: &[u8] = &[0x0A, 0x0D, 0x0D, 0x0A];
 
-/// Kinds of blocks.
 const INTERFACE: u32 = 1;
 const OLD_PACKET: u32 = 2;
 const SIMPLE_PACKET: u32 = 3;
@@ -21,13 +21,12 @@ const IF_NAME: u16 = 2;
 const IF_TSRESOL: u16 = 9;
 const IF_TSOFFSET: u16 = 14;
 
-/// Kind and length before a block's content, and the length after it, bytes.
+/// Size of kind and length before a block's content, and of all fields around the content, bytes.
 const BLOCK_HEAD: usize = 8;
 const BLOCK_FRAME: usize = 12;
 /// Maximum number of interfaces of a section. Usual captures have fewer than ten.
 const MAX_INTERFACES: usize = 1024;
 
-/// An interface of the current section.
 struct Interface {
     link: Option<LinkType>,
     channel: Channel,
@@ -36,13 +35,11 @@ struct Interface {
     offset_s: i64,
 }
 
-/// Reads a PCAPNG file.
 pub(crate) struct PcapNgReader {
     blocks: ByteStream<Box<dyn Read>>,
     big_endian: bool,
     interfaces: Vec<Interface>,
     decoder: PacketDecoder,
-    /// Offset of the block read last.
     at: u64,
 }
 
@@ -112,7 +109,7 @@ impl PcapNgReader {
                 }
                 Err(text) => return Err(damaged(text)),
             },
-            // A packet without a time cannot be placed.
+            // A packet without a time cannot become a frame.
             SIMPLE_PACKET => Item::Other,
             _ => packet(content, kind == OLD_PACKET, big_endian, &self.interfaces, &mut self.decoder)
                 .unwrap_or_else(Item::Bad),
@@ -171,7 +168,6 @@ fn interface(content: &[u8], big_endian: bool, index: usize) -> Result<Interface
     Ok(interface)
 }
 
-/// Decodes the content of a packet block.
 fn packet(
     content: &[u8],
     is_old: bool,

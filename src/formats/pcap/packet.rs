@@ -1,4 +1,4 @@
-//! Packets of SocketCAN, with or without the cooked header of Linux.
+//! Decodes packets of SocketCAN, with or without the cooked header of Linux.
 
 use packwatch_core::quantity::Timestamp;
 
@@ -30,7 +30,6 @@ impl LinkType {
     }
 }
 
-/// Message about a capture that cannot contain CAN frames.
 pub(super) fn other_link_type(number: u32) -> String {
     format!("capture of link type {number}, must be 227 (SocketCAN), 113 or 276 (cooked capture of Linux)")
 }
@@ -58,7 +57,8 @@ const FRAME_HEAD: usize = 8;
 #[derive(Debug, Default)]
 pub(super) struct PacketDecoder {
     pub(super) channels: ChannelList,
-    /// Frames whose identifier shows the order that the file should have, minus frames that show the other order.
+    /// Number of frames whose identifier shows the order that the file should have, minus the number of frames that
+    /// show the other order.
     right_order: i32,
 }
 
@@ -117,7 +117,7 @@ impl PacketDecoder {
             return Err(format!("CAN frame of {} bytes, must have at least {FRAME_HEAD}", bytes.len()));
         }
         let (len, flags) = (usize::from(bytes[4]), bytes[5]);
-        // The flags of CAN XL lie where other frames have their length, which is at most 64.
+        // The flags of CAN XL are at the position of the length of other frames, which is at most 64.
         if bytes[4] & XL != 0 {
             return Ok(Item::Xl);
         }
@@ -151,7 +151,8 @@ impl PacketDecoder {
     }
 }
 
-/// Whether this is the identifier of a usual frame: 11 bits or, with its mark, 29 bits of which the lower 16 are not zero.
+/// Whether this is the identifier of a usual frame: an 11-bit identifier, or a flagged 29-bit identifier whose lower 16
+/// bits are not zero.
 fn is_plain(id: u32) -> bool {
     id <= 0x7FF || id & (EXTENDED | REMOTE | ERROR) == EXTENDED && id & 0xFFFF != 0
 }

@@ -109,7 +109,7 @@ fn identifiers_in_wrong_order_are_turned() {
     };
     let expected = ids.map(|id| id & 0x1FFF_FFFF);
     assert_eq!(read_ids(&ids.map(|id| can(id.to_le_bytes(), 0, &[1]))), expected);
-    // One odd identifier does not turn the others.
+    // One unusual identifier does not change the byte order of the others.
     let mut right = ids.map(|id| can(id.to_be_bytes(), 0, &[1])).to_vec();
     right.insert(0, can([0x80, 0, 0, 0x10], 0, &[1]));
     assert_eq!(read_ids(&right)[1..], expected);

@@ -6,8 +6,10 @@
 //!
 //! Stamps count from the date of the first trigger block, or from the `date` line if the block has no date. The date is
 //! local time without a zone; it is read as UTC. In `timestamps relative`, each stamp counts from the previous event. A
-//! later trigger block restarts the time only if its stamps restart. Requests to send (`TxRq`), statistics, events, and
-//! frames of other buses are [`Item::Other`]: a request is followed by the frame that was sent.
+//! later trigger block restarts the time only if its stamps restart.
+//!
+//! Statistics, events, frames of other buses, and requests to send (`TxRq`) are [`Item::Other`]. A request is not a
+//! frame, because the frame that was sent follows it.
 
 use std::io;
 
@@ -28,10 +30,8 @@ const TIME: &str = "a time below 9223372036 s";
 const IDENTIFIER: &str = "an identifier of at most 7FF, or 1FFFFFFFx";
 const LENGTH: &str = "a length of 0 to 64";
 
-/// State of a log.
 pub(super) struct Asc {
     base: Base,
-    /// Whether each stamp counts from the previous event.
     is_relative: bool,
     start_ns: i64,
     /// Date of a trigger block whose first stamp is not yet known, ns.
@@ -285,7 +285,7 @@ fn skip_name(line: &mut Cursor<'_>) -> Result<bool, Fault> {
     line.parse(EXPECTED, flag)
 }
 
-/// Whether the next word is `d` or `r` of the older form of a CANFD line. The length code d is followed by 32 instead.
+/// Whether the next word is `d` or `r` of the older form of a CANFD line. A `d` before 32 is a length code instead.
 fn is_kind(mut line: Cursor<'_>) -> bool {
     match line.word() {
         b"d" => line.word() != b"32",
@@ -345,7 +345,7 @@ fn length(word: &[u8]) -> Option<usize> {
     number(word, Base::Dec).map(|len| len as usize).filter(|len| *len <= MAX_DATA)
 }
 
-/// Length of a remote request, which may be missing.
+/// Length of a remote request; 0 if it is missing.
 fn remote_length(line: Cursor<'_>) -> u8 {
     length_code(line.peek()).map_or(0, |code| code.min(8) as u8)
 }

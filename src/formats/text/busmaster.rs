@@ -19,7 +19,7 @@ use crate::Item;
 const MS_NS: i64 = 1_000_000;
 const DAY_NS: i64 = 86_400_000 * MS_NS;
 
-/// What the times of a log count from.
+/// The origin of the times of a log.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Mode {
     Absolute,
@@ -27,7 +27,6 @@ enum Mode {
     System,
 }
 
-/// State of a log.
 pub(super) struct Busmaster {
     mode: Mode,
     base: Base,

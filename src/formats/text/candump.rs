@@ -1,12 +1,11 @@
-//! Reads the forms of candump's output other than `candump -L` with absolute or relative stamps.
+//! Reads candump's screen text, and logs of `candump -L` whose stamps are the times since the previous frame.
 //!
 //! Screen text: ` (1700000000.000000)  can0  RX B -  100   [8]  05 00 ...`. All options are accepted: stamps of `-ta`,
 //! `-tA` (local time, read as UTC), `-tz` and `-td`; direction and flags of `-x`; colours of `-c`; data of `-i` (binary)
 //! and `-S` (swapped); the ASCII column of `-a`; raw length codes of `-8`; error classes of `-e`. Two digits in the
 //! brackets mark a CAN FD frame. Text without stamps cannot be used and is refused.
 //!
-//! In text and logs with `-td`, each stamp is the time since the previous frame. The stamps are added up; the log begins
-//! at 0.
+//! If stamps are the times since the previous frame (`-td`), they are added up, and the log begins at 0.
 
 use std::io;
 
@@ -31,7 +30,7 @@ pub(super) struct Candump {
     plain: Vec<u8>,
 }
 
-/// Text or log with the time since the previous frame.
+/// Text or a log whose stamps are the times since the previous frame.
 pub(super) struct CandumpDeltas {
     text: Candump,
     sum_ns: i64,
@@ -98,7 +97,7 @@ fn stamped(
 ) -> Result<Item, Fault> {
     let start = line;
     let [b'(', rest @ ..] = line.rest() else {
-        // Shell prompts, drop counts, and the second line of error frames.
+        // Shell prompts, drop counts and the second line of an error frame are not errors.
         return if is_screen_line(line.text) { Err(line.fault(STAMP)) } else { Ok(Item::Other) };
     };
     let end = memchr::memchr(b')', rest).ok_or_else(|| start.fault(STAMP))?;
@@ -249,12 +248,14 @@ pub(super) fn is_screen_line(line: &[u8]) -> bool {
 
 /// Whether the stamps of a log are the times since the previous frames (`-td`).
 ///
-/// Such stamps have fewer than ten digits of seconds. More than a quarter of them is smaller than the stamp before, or they
-/// do not grow. Stamps of `-tz`, which count from the first frame, grow, and decrease only where the frames of several
-/// interfaces are out of order. Equal stamps say nothing, because recorders with a coarse clock write them too; neither do
-/// whole seconds that do not grow.
+/// Such stamps have fewer than ten digits of seconds. More than a quarter of them are smaller than the stamp before, or
+/// the stamps do not grow.
+///
+/// Stamps of `-tz` count from the first frame, so they grow. They decrease only where the frames of several interfaces
+/// are out of order. Equal stamps prove nothing, because recorders with a coarse clock write them too. Whole seconds
+/// that do not grow prove nothing either.
 pub(super) fn has_deltas(head: &[u8]) -> bool {
-    /// Number of stamps from which it counts that they do not grow.
+    /// Minimum number of stamps to conclude that stamps do not grow.
     const FEWEST_STAMPS: usize = 16;
     let stamp = |line: &[u8]| {
         let plain = without_escapes(line);
@@ -271,7 +272,6 @@ pub(super) fn has_deltas(head: &[u8]) -> bool {
     4 * decreases > stamps.len() || stamps.len() >= FEWEST_STAMPS && !grow && !is_coarse
 }
 
-/// Removes the escape sequences that set colours.
 fn without_escapes(line: &[u8]) -> Vec<u8> {
     let mut plain = Vec::with_capacity(line.len());
     let mut bytes = line.iter().copied();

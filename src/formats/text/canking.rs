@@ -14,7 +14,6 @@ use super::cursor::{Base, Cursor, Fault, identifier, number};
 use super::{CHANNEL, Channels, Grammar, time};
 use crate::Item;
 
-/// State of a log.
 pub(super) struct CanKing {
     base: Base,
 }

@@ -12,7 +12,7 @@ use super::cursor::{Base, Cursor, Fault, frame, hex_byte, identifier, number, sc
 use super::{CHANNEL, Channels, Grammar, time};
 use crate::Item;
 
-/// A log; each line is complete in itself.
+/// The reader of a log. It has no state, because each line is complete.
 pub(super) struct Crtd;
 
 impl Grammar for Crtd {

@@ -1,10 +1,12 @@
 //! Reads the text logs of the CSS Electronics loggers CL1000, CL2000 and CL3000.
 //!
 //! Header: `# Time: 20231005T071031` (start) and further settings, then `Timestamp;Type;ID;Data` with any separator. A
-//! row: `05T071031805;0;326;0000000000000100`. The stamp is the end of year, month, day, hour, minute, second and
-//! millisecond, with or without separators, and the header's time has the missing part. If such a stamp is far before
-//! the previous stamp, the missing part has increased. Types: 0 standard, 1 extended; 8 and 9 are the same, sent by the
-//! logger.
+//! row: `05T071031805;0;326;0000000000000100`. Types: 0 standard, 1 extended; 8 and 9 are the same for frames sent by
+//! the logger.
+//!
+//! The stamp contains the last parts of year, month, day, hour, minute, second and millisecond, with or without
+//! separators. The missing first parts come from the header's time. If a stamp is far before the previous stamp, the
+//! last missing part has increased by one.
 
 use std::io;
 
@@ -20,7 +22,6 @@ const HOUR_NS: i64 = 3_600_000_000_000;
 /// Length of the parts in ns, from the hour to the millisecond.
 const PART_NS: [i64; 4] = [HOUR_NS, 60_000_000_000, 1_000_000_000, 1_000_000];
 
-/// Meaning of a column.
 #[derive(Debug, Clone, Copy)]
 enum Column {
     Time,
@@ -31,7 +32,6 @@ enum Column {
     Other,
 }
 
-/// State of a log.
 pub(super) struct Css {
     /// Start as stated by the header: year, month, day, hour, minute, second, millisecond.
     start: [i64; 7],
@@ -39,7 +39,7 @@ pub(super) struct Css {
     /// Empty before the line of column names.
     columns: Vec<Column>,
     latest_ns: Option<i64>,
-    /// Sum of the increases of the part that the stamps do not contain, ns.
+    /// Sum of the increases of the parts that the stamps do not contain, ns.
     carry_ns: i64,
 }
 
@@ -106,7 +106,7 @@ impl Css {
         let mut parts = self.start;
         let first = 7 - read_parts(field, 7, &mut parts)?;
         let at_ns = total_ns(&parts)?.checked_add(self.carry_ns)?;
-        // The missing part that increases when the stamp restarts: an hour, day or month, for example.
+        // The length of the last missing part. This part increases when the stamp restarts.
         let period_ns = match first {
             0 => None,
             1 | 2 => Some((total_ns(&next_month(parts, first))? - total_ns(&parts)?).max(0)),
@@ -137,8 +137,8 @@ fn total_ns(parts: &[i64; 7]) -> Option<i64> {
     date::midnight(year, month, day)?.checked_add(of_day_ns)
 }
 
-/// Reads the last parts of a stamp, of which `last` is the number of the last part. Returns how many parts the stamp
-/// contains. `None` if the digits do not form whole parts.
+/// Reads a stamp that ends with part number `last` into `parts`. Returns how many parts the stamp contains. `None` if
+/// the digits do not form whole parts.
 fn read_parts(field: &[u8], last: usize, parts: &mut [i64; 7]) -> Option<usize> {
     let mut digits = [0; 17];
     let mut count = 0;

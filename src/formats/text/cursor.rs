@@ -50,7 +50,6 @@ pub(super) enum Base {
     Dec,
 }
 
-/// A position in a line.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Cursor<'a> {
     pub(super) text: &'a [u8],

@@ -29,7 +29,6 @@ const MONTHS: [&[&str]; 12] = [
 const BEFORE_NOON: [&str; 4] = ["am", "a.m.", "\u{4e0a}\u{5348}", "\u{c624}\u{c804}"];
 const AFTER_NOON: [&str; 4] = ["pm", "p.m.", "\u{4e0b}\u{5348}", "\u{c624}\u{d6c4}"];
 
-/// The parts of a date found so far.
 #[derive(Debug, Default)]
 struct Parts {
     year: Option<i64>,
@@ -79,7 +78,7 @@ pub(crate) fn midnight(year: i64, month: i64, day: i64) -> Option<i64> {
 }
 
 impl Parts {
-    /// Uses one word in lower case. Ignores words with another meaning, such as weekdays.
+    /// Evaluates one word in lower case. Ignores words with another meaning, such as weekdays.
     fn word(&mut self, word: &[u8]) {
         let digits = word.iter().take_while(|byte| byte.is_ascii_digit()).count();
         if digits > 0 {
@@ -104,7 +103,8 @@ impl Parts {
         } else if word.contains(&b':') {
             self.clock(word);
         } else if let Some((first, second, year)) = numeric_date(word) {
-            // Dots separate day.month, slashes month/day unless the first number cannot be a month.
+            // With dots, the day comes first. With slashes, the month comes first, unless the first number cannot be a
+            // month.
             let is_day_first = word[digits] != b'/' || first > 12;
             let (day, month) = if is_day_first { (first, second) } else { (second, first) };
             (self.year, self.month, self.day) = (Some(year), Some(month), Some(day));
@@ -120,8 +120,8 @@ impl Parts {
         }
     }
 
-    /// Uses a time `22:13:20.123`, with further digits after another point or colon, with a zone `z` or `+01:00`, or
-    /// without separators as in `221320`.
+    /// Evaluates a time such as `22:13:20.123` or, without separators, `221320`. Further digits may follow another
+    /// point or colon, and a zone `z` or `+01:00` may follow the time.
     fn clock(&mut self, word: &[u8]) {
         let zone_at = word.iter().position(|byte| matches!(byte, b'+' | b'-' | b'z')).unwrap_or(word.len());
         let (time, zone) = word.split_at(zone_at);
@@ -161,7 +161,7 @@ fn iso_date(word: &[u8]) -> Option<(i64, i64, i64)> {
     Some((integer(word.get(..4)?)?, integer(word.get(month)?)?, integer(word.get(day)?)?))
 }
 
-/// Parses three numbers separated by `.`, `/`, `:` or `-`, of which the last has four digits.
+/// Parses three numbers separated by `.`, `/` or `-`. The last number must have four digits.
 fn numeric_date(word: &[u8]) -> Option<(i64, i64, i64)> {
     let mut fields = word.splitn(3, |byte| matches!(byte, b'.' | b'/' | b'-'));
     let (first, second, year) = (fields.next()?, fields.next()?, fields.next()?);

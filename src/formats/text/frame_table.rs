@@ -1,13 +1,15 @@
 //! Reads tables of frames: a header line that names the columns, then a row per frame.
 //!
-//! Many tools write such tables: SavvyCAN and GVRET devices (`Time Stamp,ID,Extended,Dir,Bus,LEN,D1,D2,...`), USB adapters
-//! (`NO  Direction  Time Scale  Frame Type  Frame Format  Frame ID  Length  Data`), CARBUS and CANHacker (`@ TEXT @`,
-//! always the same columns). The header decides the order of the columns and the separator.
+//! Many tools write such tables: SavvyCAN and GVRET devices (`Time Stamp,ID,Extended,Dir,Bus,LEN,D1,D2,...`), USB
+//! adapters (`NO  Direction  Time Scale  Frame Type  Frame Format  Frame ID  Length  Data`), and CARBUS and CANHacker
+//! (`@ TEXT @`, always the same columns). The header decides the order of the columns and the separator.
 //!
-//! The header states the unit of the times; times with colons are times of day. If the header states no unit, the first
-//! 16 KiB decide: times with a decimal point are seconds, whole numbers are Unix times or have the usual unit of their
-//! column. [`Grammar::remark`] names a unit that was assumed. Identifiers and data bytes are hexadecimal, or decimal if the
-//! first rows show it. An identifier above 7FF is extended whatever the table says, as in SavvyCAN.
+//! Times with colons are times of day. All other times have the unit that the header states. If the header states no
+//! unit, the first 16 KiB of the log decide. Times with a decimal point are then seconds. Whole numbers are Unix times,
+//! or have the usual unit of their column. [`Grammar::remark`] names a unit that was assumed.
+//!
+//! Identifiers and data bytes are hexadecimal, or decimal if the first rows show it. An identifier above 7FF is
+//! extended, even if the table says otherwise, as in SavvyCAN.
 
 use std::io;
 
@@ -24,17 +26,16 @@ const CARBUS_COLUMNS: &[u8] = b"time(s)\tbus\tflags\tid\tlen\tdata";
 const MICROSECONDS: i32 = 3;
 const MILLISECONDS: i32 = 6;
 const SECONDS: i32 = 9;
-/// Number of rows from which their times tell the unit.
+/// Minimum number of rows whose times are compared with [`FRAME_NS`] to find the unit.
 const FEWEST_ROWS: usize = 20;
-/// Smallest and largest mean time between frames. Four buses at 1 Mbit/s carry the shortest frames without a pause; a
-/// recorder of a bus gets several frames per minute.
+/// Smallest and largest plausible mean time between frames. The lower limit is below the mean of four buses at 1 Mbit/s
+/// that carry the shortest frames without a pause. At the upper limit, a bus carries six frames per minute.
 const FRAME_NS: [i64; 2] = [10_000, 10_000_000_000];
 const DAY_NS: i64 = 86_400_000_000_000;
 
-/// Meaning of a column.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Column {
-    /// The time; its unit, if the header states one.
+    /// The time, with its unit if the header states it.
     Time(Option<i32>),
     /// The time of GVRET devices, in microseconds unless the rows contradict.
     TimeStamp,
@@ -48,7 +49,6 @@ enum Column {
     Other,
 }
 
-/// State of a log.
 pub(super) struct FrameTable {
     /// Empty before the header line.
     columns: Vec<Column>,
@@ -56,10 +56,9 @@ pub(super) struct FrameTable {
     has_length: bool,
     separator: u8,
     base: Base,
-    /// Unit of the times.
     unit: i32,
     is_unit_assumed: bool,
-    /// Start of the present day, and the latest time, for times of day.
+    /// For times of day: start of the present day, and latest time of day.
     day_ns: i64,
     latest_ns: i64,
 }
@@ -127,11 +126,10 @@ impl Grammar for FrameTable {
 #[derive(Default)]
 struct FirstRows {
     times: Vec<i64>,
-    /// Number of times with a decimal point.
     decimals: usize,
     has_three_digits: bool,
     has_hex: bool,
-    /// Whether an identifier is standard according to the table, but not if it is hexadecimal.
+    /// Whether the table marks an identifier as standard that would exceed 7FF as a hexadecimal number.
     has_decimal_id: bool,
 }
 
@@ -256,7 +254,7 @@ impl FrameTable {
         Ok(Item::Frame { time, channel, frame })
     }
 
-    /// The time of a row. A time of day far before the latest one is of the next day.
+    /// The time of a row. A time of day far before the latest time belongs to the next day.
     fn time_ns(&mut self, field: &[u8]) -> Option<i64> {
         if !field.contains(&b':') {
             return scaled(field, self.unit);
@@ -264,7 +262,7 @@ impl FrameTable {
         let at_ns = time_of_day_ns(field)?;
         let ahead_ns = at_ns - self.latest_ns;
         if ahead_ns > DAY_NS / 2 && self.day_ns > 0 {
-            // A frame of the day before that was recorded late.
+            // The frame belongs to the previous day and was recorded late.
             return at_ns.checked_add(self.day_ns - DAY_NS);
         }
         if ahead_ns < -DAY_NS / 2 {
@@ -275,7 +273,7 @@ impl FrameTable {
     }
 }
 
-/// What the readers say about a length that contradicts the data.
+/// The expected content, for the fault about a length that contradicts the data.
 const LENGTH: &str = "as many data bytes as the row's length states";
 
 /// Kind of a row, as its column `Frame Type` states it.
@@ -345,7 +343,7 @@ fn column(name: &str) -> Option<Column> {
             Column::Time(match unit.trim_matches([')', ']', ' ', '"']) {
                 "" => None,
                 "ns" | "nanoseconds" => Some(0),
-                // Two letters for micro, and a byte of Latin-1.
+                // The micro sign is one of two Unicode letters, or a Latin-1 byte that was replaced.
                 "us" | "\u{b5}s" | "\u{3bc}s" | "\u{fffd}s" | "microseconds" => Some(MICROSECONDS),
                 "ms" | "milliseconds" => Some(MILLISECONDS),
                 "s" | "sec" | "seconds" => Some(SECONDS),

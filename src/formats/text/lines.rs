@@ -112,7 +112,8 @@ impl Lines {
         false
     }
 
-    /// Returns the rest of the buffer as the last line, or the error of the source instead of an incomplete line.
+    /// Returns the rest of the buffer as the last line. If the source has failed, the line is incomplete, so the error
+    /// is returned instead.
     fn last(&mut self, is_too_long: bool) -> io::Result<Option<Line<'_>>> {
         let line = self.start..self.end;
         self.start = self.end;
@@ -171,7 +172,7 @@ impl<R: Read> Read for Utf16<R> {
         let mut raw = [0; 4096];
         let mut len = 0;
         while len == 0 && !buffer.is_empty() {
-            // Each two raw bytes give one byte, so that `buffer` cannot overflow.
+            // Two raw bytes give one byte, so `buffer` cannot overflow.
             let wanted = raw.len().min(buffer.len());
             let count = self.source.read(&mut raw[..wanted])?;
             if count == 0 {

@@ -12,7 +12,7 @@ use crate::Item;
 
 const HEADER: &[u8] = b"timestamp,arbitration_id,extended,remote,error,dlc,data";
 
-/// A log; each line is complete in itself.
+/// The reader of a log. It has no state, because each line is complete.
 pub(super) struct PythonCan;
 
 impl Grammar for PythonCan {

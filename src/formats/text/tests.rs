@@ -10,7 +10,6 @@ mod damage;
 mod forms;
 mod same;
 
-/// Reads a whole log of a format.
 fn read_as(format: Format, text: &[u8]) -> (Vec<Item>, Vec<Channel>) {
     let source = Source { reader: Box::new(Cursor::new(text.to_vec())), file: None };
     let mut log = format.open(source).expect("opens");
@@ -21,13 +20,12 @@ fn read_as(format: Format, text: &[u8]) -> (Vec<Item>, Vec<Channel>) {
     (items, log.channels().to_vec())
 }
 
-/// Recognises and reads a whole log.
 fn read(text: &[u8]) -> (Vec<Item>, Vec<Channel>) {
     read_as(Format::recognise(text).expect("recognised"), text)
 }
 
-/// Formats an item: `1.5 0 100 05 00`, with the number of the channel and R, F (FD), B (BRS), E (ESI) after the
-/// identifier. Extended identifiers have 8 digits.
+/// Formats an item as time, channel, identifier and data: `1.5 0 100 05 00`. R (remote), F (FD), B (BRS) and E (ESI)
+/// follow the identifier. Extended identifiers have 8 digits.
 fn shown(item: &Item, channels: &[Channel]) -> String {
     let number = |channel: &u8| match &channels[usize::from(*channel)] {
         Channel::Name(name) => name.clone(),

@@ -1,12 +1,12 @@
 //! Reads trace files (`.trc`) of PEAK tools, versions 1.0 to 3.0.
 //!
 //! Comment lines begin with `;`. The header contains `;$FILEVERSION=2.1`, `;$STARTTIME=45244.925` (days since 30
-//! December 1899) and, from version 2.0, `;$COLUMNS=N,O,T,B,I,d,R,L,D`. Without the first line, the version is 1.0;
-//! its start is the comment `Start time:`. Offsets are in milliseconds. An identifier with more than four digits is
+//! December 1899) and, from version 2.0, `;$COLUMNS=N,O,T,B,I,d,R,L,D`. If the file version is missing, it is 1.0, and
+//! the comment `Start time:` states the start. Offsets are in milliseconds. An identifier with more than four digits is
 //! extended.
 //!
-//! A date in a file is local time without a zone; it is read as UTC. The start time is a number of 64 bits, which
-//! contains microseconds. If it was written with fewer digits, the start is a whole millisecond if the digits allow it.
+//! A date in a file is local time without a zone; it is read as UTC. The start time is a 64-bit float, which resolves
+//! microseconds. If its written digits agree with a whole millisecond, that millisecond is the start.
 
 use std::io;
 
@@ -20,12 +20,11 @@ use crate::Item;
 /// 1 January 1970 in days since 30 December 1899.
 const UNIX_DAYS: i128 = 25_569;
 const DAY_NS: i128 = 86_400_000_000_000;
-/// Bits of a day's fraction that a number of 64 bits contains, for dates from 1911.
+/// Number of bits in which a 64-bit float stores the fraction of a day, for dates from 1911.
 const FRACTION_BITS: i32 = 40;
 /// Largest number of columns. The newest version has 15.
 const MAX_COLUMNS: usize = 32;
 
-/// State of a log.
 pub(super) struct Trc {
     /// The columns by the letters of `$COLUMNS`. `1` is the type of versions 1.1 to 1.3, which contains the direction.
     columns: Vec<u8>,
@@ -60,7 +59,7 @@ impl Grammar for Trc {
     }
 }
 
-/// The parts of a row, as far as they are read.
+/// The parts of a row that have been read.
 struct Row<'a> {
     offset_ns: i64,
     kind: &'a [u8],
@@ -110,7 +109,7 @@ impl Trc {
                 b'T' | b'1' => row.kind = line.word(),
                 b'B' => row.channel = Some(line.parse(CHANNEL, |word| bus(word, channels))?),
                 b'I' => {
-                    // Rows of other types have other columns after the bus.
+                    // Rows without a frame have other columns after the bus.
                     if let Some(item) = self.without_identifier(&row, at, channels)? {
                         return Ok(item);
                     }
@@ -199,7 +198,7 @@ impl Row<'_> {
     }
 }
 
-/// Takes data bytes. Spaces between them may be missing. Also returns the place after them.
+/// Takes data bytes. Spaces between them may be missing. Also returns the position after them.
 fn data(mut line: Cursor<'_>, len: usize) -> Result<([u8; MAX_DATA], Cursor<'_>), Fault> {
     let mut data = [0; MAX_DATA];
     for byte in &mut data[..len] {
@@ -227,7 +226,7 @@ fn length(word: &[u8]) -> Option<usize> {
 fn start_ns(days: &[u8]) -> Option<i64> {
     let text = String::from_utf8_lossy(days).replace(',', ".");
     let value: f64 = text.parse().ok().filter(|days: &f64| (0.0..200_000.0).contains(days))?;
-    // The product of the number and the nanoseconds of a day, without rounding: the number has a mantissa of 53 bits.
+    // Multiplies as integers, because a floating-point product would be rounded.
     let scale = 2_f64.powi(FRACTION_BITS);
     let exact_ns = ((value * scale) as i128 * DAY_NS) >> FRACTION_BITS;
     let digits = text.split_once('.').map_or(0, |(_, digits)| digits.len().min(17) as u32);

@@ -21,9 +21,9 @@
 //!    table that `gives` the parameters of an algorithm, the key sets the field of the same name. To set another field,
 //!    or to compute the value, write `=> field: value` on the same line.
 //! 2. Add the field to the algorithm's parameters.
-//! 3. Run `packwatch check --reference > docs/src/reference/keys.md`; a test compares the two.
+//! 3. Run `packwatch check --reference > docs/src/reference/keys.md`. A test fails if this page is out of date.
 //!
-//! The declaration determines how the key is read, its default, range check and fault texts, and its text in the
+//! The declaration determines how the key is read, its default, its range, its fault messages, and its text in the
 //! reference and the manual page. A check that involves several keys belongs in `checks/cross`. A new table also needs
 //! a line in `schema/tables`.
 

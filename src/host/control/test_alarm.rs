@@ -44,16 +44,16 @@ pub struct ChannelReport {
     pub error: Option<String>,
 }
 
-/// Counts of observed frames.
+/// Counts of observed frames. A test frame is an alarm frame of the tested rule with the test marker.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct ObservedFrames {
-    /// Frames of the tested rule with the test marker.
+    /// Number of test frames.
     pub tests: u64,
-    /// Time of the first frame of the tested rule with the test marker.
+    /// Time of the first test frame.
     pub first: Option<Timestamp>,
-    /// Time of the last frame of the tested rule with the test marker.
+    /// Time of the last test frame.
     pub last: Option<Timestamp>,
-    /// Whether the last frame of the tested rule with the test marker reported the end of the test.
+    /// Whether the last test frame reported the end of the test.
     pub ended: bool,
     /// Frames of other rules with the test marker. Such frames show that another test is running.
     pub foreign: u64,
@@ -77,7 +77,6 @@ impl ChannelReport {
     }
 }
 
-/// The signals of an alarm frame.
 #[derive(Debug, Clone)]
 struct AlarmReader {
     rule: SignalPlan,
@@ -98,7 +97,6 @@ impl AlarmReader {
     }
 }
 
-/// One interface during the test.
 struct MonitoredChannel {
     tap: PassiveSocket,
     reader: AlarmReader,
@@ -107,7 +105,6 @@ struct MonitoredChannel {
 }
 
 impl MonitoredChannel {
-    /// Reads all received frames.
     fn read_all(&mut self, rule: Rule) {
         let mut received = Vec::new();
         while self.report.error.is_none() {

@@ -27,19 +27,16 @@ const MIN_TOKEN: usize = 16;
 const MAX_TOKEN: usize = 128;
 const COOKIE_NAME: &str = "packwatch_token";
 
-/// Who may read.
 pub(super) struct Access {
     token: Option<String>,
     is_local: bool,
 }
 
-/// The answer to a request for access.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum Decision {
     Allowed,
     /// The query contains the token: set this cookie and redirect to the address without the query.
     SetCookie(String),
-    /// The token is missing or wrong.
     NeedsToken,
     /// Served only on an address of this computer, or with a token.
     OnlyLocal,
@@ -55,7 +52,7 @@ impl Access {
         Ok(Self { token, is_local: address.to_canonical().is_loopback() })
     }
 
-    /// Whether the page is served: not on the address of a network without a token.
+    /// Whether the page is served. On a network address, it is served only with a token.
     pub(super) fn has_page(&self) -> bool {
         self.is_local || self.token.is_some()
     }

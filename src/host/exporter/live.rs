@@ -29,7 +29,7 @@ use crate::status::stream::{SILENCE, follow};
 pub(super) const KEPT: [Quantity; 4] = [Quantity::Soc, Quantity::Voltage, Quantity::Current, Quantity::TemperatureMax];
 /// Time between two points of the last hour. A picture of the hour is a few hundred pixels wide.
 const POINT_PERIOD: Duration = Duration::from_secs(5);
-/// Number of points: one hour.
+/// Number of points in one hour.
 const POINTS: usize = 720;
 
 const DATA: &[u8] = b"data: ";
@@ -37,18 +37,15 @@ const DATA: &[u8] = b"data: ";
 /// A time (s, on the daemon's clock) and the values of [`KEPT`].
 type Point = [Option<f64>; 1 + KEPT.len()];
 
-/// The latest report about the daemon.
 #[derive(Debug, Clone, Default)]
 enum Report {
-    /// The daemon has not been asked yet.
     #[default]
     Awaited,
     Gone,
-    /// The event of a document, and its time.
+    /// The latest document as an event, and the time of its arrival.
     Document(Bytes, Instant),
 }
 
-/// The latest document and the last hour.
 #[derive(Debug, Default)]
 pub(super) struct Live {
     report: watch::Sender<Report>,
@@ -56,7 +53,7 @@ pub(super) struct Live {
 }
 
 impl Live {
-    /// Reads the stream next to the status socket `socket` for ever.
+    /// Reads the stream that belongs to the status socket `socket`, for ever.
     pub(super) async fn follow(&self, socket: &Path) {
         let mut kept_at = None;
         let handle = |line: Result<&[u8], &str>| {
@@ -125,7 +122,6 @@ impl Live {
     }
 }
 
-/// Body of an answer.
 pub(super) enum AnswerBody {
     Whole(Full<Bytes>),
     Events(mpsc::Receiver<Bytes>),

@@ -17,8 +17,8 @@ const NONCE: &str = "NONCE";
 /// Text in [`PAGE`] that the names and units replace.
 const CATALOGUE: &str = "CATALOGUE";
 
-/// Returns the page with the names and units of all quantities, alarms and findings. `has_report`: with a link to the
-/// report.
+/// Returns the page with the names and units of all quantities, alarms and findings. If `has_report` is true, the page
+/// has a link to the report.
 pub(super) fn template(has_report: bool) -> String {
     PAGE.replacen(CATALOGUE, &catalogue(has_report).to_string(), 1)
 }
@@ -35,8 +35,8 @@ pub(super) fn answer(template: &str) -> (String, String) {
     (template.replace(NONCE, &nonce), policy)
 }
 
-/// The names and units that the page shows. The text of a rule's value 1, and of a finding of the size 1 ± 1, show the
-/// page the scale, the decimals and the unit.
+/// The names and units that the page shows. The page takes the scale, the decimals and the unit from sample texts: a
+/// rule's value 1, and a finding of the size 1 ± 1.
 fn catalogue(has_report: bool) -> Value {
     let row = |(row, shown): (&'static QuantityRow, &'static Presentation)| {
         json!([row.key, row.std_key, row.unit.symbol(), shown.mqtt_name, shown.about])

@@ -1,4 +1,4 @@
-//! Tests of the exporter: requests, access, the page in a real browser.
+//! Tests the exporter: requests, access, and the page in a real browser.
 
 mod browser;
 
@@ -90,7 +90,7 @@ impl Drop for FakeDaemon {
     }
 }
 
-/// A connection on which a request was sent.
+/// Sends a request. Returns the connection.
 fn send(address: SocketAddr, path: &str, headers: &str) -> BufReader<std::net::TcpStream> {
     let mut stream = std::net::TcpStream::connect(address).unwrap();
     stream.set_read_timeout(Some(Duration::from_secs(20))).unwrap();

@@ -1,8 +1,8 @@
 //! Writes a file on a separate thread, so that a slow disk never delays the daemon's loop.
 //!
-//! Bytes are collected and sent to the thread in pieces. If the thread could not write a piece, or if too many pieces
-//! wait for a slow disk, the next piece cannot be sent, and `write` or `flush` returns an error. The caller then gives
-//! up the file and continues.
+//! Bytes are collected and sent to the thread in pieces. A piece cannot be sent if the thread failed to write an
+//! earlier piece, or if too many pieces wait for a slow disk. In both cases `write` or `flush` returns an error, and
+//! the caller gives up the file and continues.
 
 use std::fs::File;
 use std::io::{self, Write};
@@ -17,10 +17,10 @@ use super::segments::{SegmentLimits, SegmentWriter};
 
 /// Number of bytes that are collected before they are sent to the thread. A flush sends the bytes collected so far.
 const PIECE_BYTES: usize = 64 * 1024;
-/// Maximum number of waiting pieces. Together, these pieces have 4 MB: ten seconds of a full 1 Mbit/s bus.
+/// Maximum number of waiting pieces. They hold 4 MB, which is ten seconds of a full 1 Mbit/s bus.
 const MAX_PIECES: usize = 64;
 
-/// Longest wait for the last bytes when the file is finished. This is half of the time after which systemd kills the
+/// Maximum wait for the last bytes when the file is finished. It is half of the time after which systemd kills the
 /// service.
 pub const MAX_FINISH: Duration = Duration::from_secs(5);
 
@@ -66,8 +66,7 @@ impl BackgroundFile {
         Ok(Self { piece: Vec::with_capacity(PIECE_BYTES), pieces: Some(pieces), writer: Some(writer) })
     }
 
-    /// Writes the remaining bytes, synchronises the file to disk, and waits until this is done, but at most
-    /// [`MAX_FINISH`].
+    /// Writes the remaining bytes and synchronises the file to disk. Waits for this at most [`MAX_FINISH`].
     ///
     /// # Errors
     /// Fails if the thread could not write or did not finish in time, or if the remaining bytes could not be sent to
@@ -114,7 +113,6 @@ pub fn ends_in_time<T>(thread: &JoinHandle<T>) -> bool {
         if began.elapsed() > MAX_FINISH {
             return false;
         }
-        // The thread is checked every 5 ms.
         std::thread::sleep(Duration::from_millis(5));
     }
     true
@@ -147,7 +145,7 @@ fn write_all(mut file: File, queue: &Receiver<Vec<u8>>) -> io::Result<()> {
     for piece in queue {
         file.write_all(&piece)?;
     }
-    // Pipes and devices cannot be synchronised (EINVAL); this is not an error.
+    // Pipes and devices cannot be synchronised (EINVAL), which is not an error.
     file.sync_all().or_else(|error| if error.raw_os_error() == Some(22) { Ok(()) } else { Err(error) })
 }
 

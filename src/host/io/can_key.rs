@@ -1,9 +1,9 @@
 //! Reads the key of authenticated frames once at the start, from a systemd credential or a file. The key is never
 //! shown.
 //!
-//! In: the location of the key. Out: the AES-128-CMAC of given bytes. It is an error if the key is missing, if it does
-//! not have 16 bytes or 32 hex digits, or if all its bytes are equal. A key file must also be closed to other users; a
-//! credential is protected by the service manager. Errors never contain the key.
+//! In: the location of the key. Out: the AES-128-CMAC of given bytes. A key must have 16 bytes or 32 hex digits, and
+//! its bytes must not all be equal. A key file must not be readable by other users. A credential is protected by the
+//! service manager. Errors never contain the key.
 
 use std::ffi::OsString;
 use std::fmt;

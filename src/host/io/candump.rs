@@ -98,9 +98,6 @@ pub fn parse_line(line: &[u8]) -> Result<Line<'_>, LineError> {
 }
 
 /// Parses a stamp `(seconds.fraction)` at the start of `text`. Also returns the rest of the text.
-///
-/// # Errors
-/// Fails if the text does not begin with a stamp.
 pub fn parse_stamp(text: &[u8]) -> Result<(Timestamp, &[u8]), LineError> {
     let mut cursor = Cursor { text, at: 0 };
     let time = cursor.stamp()?;
@@ -128,9 +125,6 @@ pub enum StampDigits {
 }
 
 /// Writes one line like `candump -L`, including the line feed.
-///
-/// # Errors
-/// Returns the errors of `out`.
 pub fn write_line(
     out: &mut impl Write,
     time: Timestamp,
@@ -156,9 +150,6 @@ pub fn frame_text(frame: &Frame) -> String {
 }
 
 /// Writes `(seconds.fraction)`.
-///
-/// # Errors
-/// Returns the errors of `out`.
 pub fn write_stamp(out: &mut impl Write, time: Timestamp, digits: StampDigits) -> io::Result<()> {
     let (sign, nanos) = (if time.nanos() < 0 { "-" } else { "" }, time.nanos().unsigned_abs());
     let (seconds, fraction) = (nanos / 1_000_000_000, nanos % 1_000_000_000);

@@ -1,21 +1,21 @@
-//! A clock that never steps: wall time at the program's start plus CLOCK_BOOTTIME since the start (which counts
-//! suspend).
+//! A clock that never steps: wall time at the program's start plus the CLOCK_BOOTTIME that has passed since then
+//! (which includes suspend).
 //!
 //! The kernel stamps received frames with CLOCK_REALTIME, or with the adapter's own clock. CLOCK_REALTIME may step
 //! (NTP, a clock set by hand). The origin of the adapter's clock is arbitrary. [`StampMapper`] converts both kinds of
 //! stamps to the program's clock:
 //!
 //! * A software stamp becomes `stamp - (realtime - boottime)`. This difference is measured when the frame is read.
-//!   Around a step of the clock, the difference that was measured before the step is tried too. If both give a
-//!   plausible time, the later one is used. If neither does, the time of reading replaces the stamp.
+//!   Around a step of the clock, the difference from before the step is also tried. If both times are plausible, the
+//!   later one is used. If neither is plausible, the time of reading replaces the stamp.
 //! * A time is plausible if it is not after the reading of the frame, and not before the socket was last found empty
-//!   (with a small tolerance). The length of this interval therefore bounds the error of any stamp.
+//!   (with a small tolerance). The length of this interval bounds the error of any stamp.
 //! * A hardware stamp becomes `stamp + offset`. The offset is the smallest recent value of `arrival - stamp`, because
 //!   queueing can only increase this value. Old values are forgotten, so that the offset follows the drift of the
 //!   adapter's quartz.
 //!
-//! Times of one interface never go backwards. All functions except the clock readings are pure: tests pass their own
-//! clock.
+//! Times of one interface never go backwards. All functions except the clock readings are pure, so that tests can
+//! pass their own clock.
 
 use std::time::Duration;
 
@@ -24,11 +24,11 @@ use nix::time::{ClockId, clock_gettime};
 
 use crate::quantity::Timestamp;
 
-/// Length of a window, ns. The smallest offset of a hardware stamp is remembered for one to two windows. In one window,
-/// a quartz with an error of 100 ppm drifts by 1 ms.
+/// Length of a window (ns). The smallest offset of a hardware stamp is kept for one to two windows. In one window, a
+/// quartz with an error of 100 ppm drifts by 1 ms.
 const HARDWARE_WINDOW_NS: i64 = 10_000_000_000;
 
-/// Maximum number of readings of the wall clock for one [`Reading`].
+/// Maximum number of attempts to read the clocks for one [`Reading`].
 const MOST_READINGS: usize = 4;
 
 /// Both kernel clocks at one moment, ns since their origins.
@@ -46,9 +46,9 @@ impl Reading {
         Self::between(nanos_of)
     }
 
-    /// Reads the wall clock between two readings of the boot clock. Several attempts are made, and the attempt with the
-    /// smallest distance between these two readings is kept. The reason: on a busy processor this thread may wait for
-    /// milliseconds between two calls, which would falsify the difference of the clocks.
+    /// Reads the wall clock between two readings of the boot clock. Of several attempts, keeps the one in which these
+    /// two readings are closest. On a busy processor, the thread may wait for milliseconds between two calls, which
+    /// would falsify the difference of the clocks.
     fn between(clock: impl Fn(ClockId) -> i64) -> Self {
         let read = || {
             let before_ns = clock(ClockId::CLOCK_BOOTTIME);
@@ -58,8 +58,7 @@ impl Reading {
         };
         let mut closest = read();
         for _ in 1..MOST_READINGS {
-            // If the boot clock readings differ by at most this many ns, no further attempt is needed. Two system calls
-            // on a slow processor take this long.
+            // Two system calls on a slow processor take this long (ns), so a further attempt would not be better.
             if closest.0 <= 20_000 {
                 break;
             }
@@ -155,7 +154,7 @@ pub struct StampMapper {
 }
 
 impl StampMapper {
-    /// A mapper for a socket opened at `reading`; nothing can have arrived earlier.
+    /// Creates a mapper for a socket opened at `reading`. No frame can have arrived earlier.
     pub fn new(clock: MappedClock, reading: Reading) -> Self {
         Self {
             clock,
@@ -206,15 +205,14 @@ impl StampMapper {
     fn software(&self, stamp: Option<i64>, reading: Reading) -> i64 {
         let candidates =
             [reading.offset_ns(), self.emptied_offset_ns].map(|offset| stamp.map(|s| s.saturating_sub(offset)));
-        // The candidates differ only around a step. Frames are read soon after they arrive. If both candidates are
-        // plausible, the later one is therefore used.
+        // The candidates differ only around a step. If both are plausible, use the later one, because frames are read
+        // soon after they arrive.
         candidates.into_iter().flatten().filter(|&t| self.possible(t, reading)).max().unwrap_or(reading.boottime_ns)
     }
 
-    /// Whether a frame that was read at `reading` can have arrived at `arrived_ns`.
     fn possible(&self, arrived_ns: i64, reading: Reading) -> bool {
-        // Tolerance: a frame is stamped up to 20 ms before it is queued, because of a soft interrupt and, with USB
-        // adapters, batching.
+        // Tolerance: a frame may be stamped up to 20 ms before it is queued, because of soft interrupts and the
+        // batching of USB adapters.
         (self.emptied_ns - 20_000_000..=reading.boottime_ns).contains(&arrived_ns)
     }
 }
@@ -400,7 +398,7 @@ mod tests {
     #[test]
     fn silence_of_hours_discards_old_offsets() {
         let mut clock = HardwareClock::default();
-        // The adapter's quartz is 50 ppm slow: 1.44 s in eight silent hours.
+        // The adapter's quartz is 50 ppm slow, which gives 1.44 s in eight silent hours.
         let stamp = |t: i64| t - t / 20_000;
         clock.map(stamp(S), S);
         for arrived in (0..200).map(|k| 8 * 3600 * S + k * 100 * MS) {

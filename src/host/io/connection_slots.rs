@@ -1,6 +1,6 @@
-//! Limits a server's connections: in total, per user and per client, with slots that only root may take. If a limit is
-//! reached, a new connection replaces the connection that has been idle longest, so that silent and slow clients cannot
-//! keep others out. If a client or a user reaches its limit, it loses one of its own connections.
+//! Limits a server's connections: in total, per user and per client. Some slots are reserved for root. If all slots
+//! are taken, a new connection replaces the connection that has been idle longest, so that silent and slow clients
+//! cannot keep others out. If a client or a user reaches its own limit, it loses one of its own connections.
 //!
 //! A connection is idle while the client has to act: to send a request, or to read the answer. A connection is never
 //! closed while its request is being processed, or within [`GRACE`] of becoming idle. If such connections take all
@@ -17,20 +17,15 @@ use tokio::task::AbortHandle;
 /// client needs far less.
 pub(crate) const GRACE: Duration = Duration::from_millis(250);
 
-/// Limits on simultaneous connections.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct SlotLimits {
-    /// Maximum number of connections of all clients together.
     pub total: usize,
     /// Slots of `total` that only root may take.
     pub for_root: usize,
-    /// Maximum number of connections of one user.
     pub per_user: usize,
-    /// Maximum number of connections of one client.
     pub per_client: usize,
 }
 
-/// Who has opened a connection.
 pub(crate) trait Client: PartialEq {
     /// The number of the user, if the kernel reports it.
     fn user(&self) -> Option<u32> {
@@ -38,11 +33,11 @@ pub(crate) trait Client: PartialEq {
     }
 }
 
-/// A client over TCP is an address.
+/// A TCP client is identified by its address.
 impl Client for IpAddr {}
 
-/// A client over a Unix socket is a process of a user. The connections of processes that the kernel does not identify
-/// count as one process.
+/// A client of a Unix socket is identified by user and process. Processes that the kernel does not identify count as
+/// one process.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct LocalProcess {
     user: u32,
@@ -61,7 +56,6 @@ impl Client for LocalProcess {
     }
 }
 
-/// The slots; a client is identified by `K`.
 #[derive(Debug)]
 pub(crate) struct ConnectionSlots<K> {
     limits: SlotLimits,
@@ -80,7 +74,6 @@ struct Slot<K> {
 pub struct Activity(Arc<Mutex<Option<Instant>>>);
 
 impl Activity {
-    /// The activity of a new connection, which is idle.
     pub(crate) fn new() -> Self {
         Self(Arc::new(Mutex::new(Some(Instant::now()))))
     }
@@ -105,7 +98,6 @@ impl Activity {
 }
 
 impl<K: Client> ConnectionSlots<K> {
-    /// Creates slots without connections.
     pub(crate) fn new(limits: SlotLimits) -> Self {
         Self { limits, taken: Vec::new() }
     }
@@ -123,12 +115,11 @@ impl<K: Client> ConnectionSlots<K> {
             return self.close_idlest(now, |place| place.client.user() == user);
         }
         let free_to = if user == Some(0) { total } else { total - for_root };
-        // A user cannot take the slots of root.
+        // Only root may replace connections of root.
         let is_root = |of: Option<u32>| of == Some(0);
         self.taken.len() < free_to || self.close_idlest(now, |place| is_root(user) || !is_root(place.client.user()))
     }
 
-    /// Registers a connection after [`make_room`](Self::make_room).
     pub(crate) fn take(&mut self, client: K, activity: Activity, task: AbortHandle) {
         self.taken.push(Slot { client, activity, task });
     }

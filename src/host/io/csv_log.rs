@@ -1,15 +1,16 @@
 //! Reads tables of samples: the exports of cyclers, applications and battery management systems, and packwatch's own
-//! CSV. All commands read tables with this reader.
+//! CSV.
 //!
 //! In: a table and the options. Out: rows of values in packwatch's units; a positive current is a discharge. The
-//! columns are found by name in a [dictionary](dictionary), or the user names them. Units are in the header, in a
-//! second header row, or after the name that the user gives. The first rows decide the rest: [judge] finds the sign of
-//! the current and units that the header does not state, and rejects values that cannot be in the stated unit. An
-//! empty or missing field means "no reading", as `-` and `n/a` do. A row is bad if its time cannot be read, or if another
-//! field is neither a finite number nor such a text. A section column
-//! (`cycle`, `segment`, `ref`, or the column that the user names) divides a file into sections; time restarts in each
-//! section. If a table states the start times of the sections, the stamps are absolute. Otherwise, the gaps between the
-//! sections are unknown. [`TableReading`] says what was read as what.
+//! columns are found by name in a [dictionary](dictionary), or the user names them. Units come from the header, from
+//! a second header row, or from the user. From the first rows, [judge] finds the sign of the current and units that
+//! the header does not state. It rejects values that cannot be in the stated unit. An empty or missing field, `-` and
+//! `n/a` mean "no reading". A row is bad if its time cannot be read, or if another field is neither a finite number
+//! nor one of these.
+//!
+//! A section column (`cycle`, `segment`, `ref`, or the column that the user names) divides a file into sections. Time
+//! restarts in each section. If a table states the start times of the sections, the times are absolute. Otherwise,
+//! the gaps between the sections are unknown. [`TableReading`] reports how the table was understood.
 
 use std::collections::HashMap;
 use std::io::Read;
@@ -34,7 +35,7 @@ pub use reading::TableReading;
 use state::{CurrentSign, is_rest};
 use time_text::TimeText;
 
-/// Largest number of rows that are judged before the first row is returned.
+/// Maximum number of rows that are judged before the first row is returned.
 const MAX_JUDGED_ROWS: usize = 50_000;
 
 /// Options for reading tables of samples.
@@ -50,7 +51,7 @@ pub struct CsvOptions {
     pub start_times: Option<PathBuf>,
     /// Number of cells in the configuration.
     pub cells: u16,
-    /// Number of cells in series, by which a total voltage is divided to judge it.
+    /// Number of cells in series. A total voltage is divided by this number before it is judged.
     pub series: u16,
     /// Number of temperature sensors in the configuration.
     pub sensors: u16,
@@ -80,7 +81,6 @@ pub struct CsvLog {
     time: TimeText,
     last_time: Option<Timestamp>,
     is_first_time_late: bool,
-    /// The column of each used channel.
     channels: Vec<(Channel, Column)>,
     sign: CurrentSign,
     max_current_a: f64,
@@ -98,16 +98,14 @@ pub struct CsvLog {
     pub kind_text: Vec<u8>,
 }
 
-/// The section column and the current section.
 struct Sections {
     column: usize,
     starts: Option<HashMap<Vec<u8>, Timestamp>>,
     current: Option<Vec<u8>>,
-    /// Start of the current section; `None` = unknown.
     start: Option<Timestamp>,
 }
 
-/// Whether a log is a table of samples by its name.
+/// Whether the file name of a log has an ending that tables of samples have.
 pub fn has_table_name(path: &Path) -> bool {
     const ENDINGS: [&str; 7] = [".csv", ".tsv", ".mpt", ".bdf", ".parquet", ".pq", ".parq"];
     let name = path.file_name().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
@@ -115,7 +113,6 @@ pub fn has_table_name(path: &Path) -> bool {
     ENDINGS.iter().any(|ending| name.ends_with(ending))
 }
 
-/// Whether a log is a table of samples, by its name or by its first bytes.
 pub(super) fn is_table(path: &Path, head: &[u8]) -> bool {
     let first_line = after_remarks(head).split(|&byte| byte == b'\n').next().unwrap_or_default();
     let is_utf16 = head.starts_with(&[0xFF, 0xFE]) || head.starts_with(&[0xFE, 0xFF]);
@@ -127,7 +124,8 @@ pub(super) fn is_table(path: &Path, head: &[u8]) -> bool {
                 || super::table::has_header(head, &dictionary::score)))
 }
 
-/// The first bytes of a log without the comments (`#`) at its beginning. A comment may contain commas, as tables do.
+/// The first bytes of a log without the comments (`#`) at its beginning, because a comment may contain commas like a
+/// table.
 fn after_remarks(mut head: &[u8]) -> &[u8] {
     while head.starts_with(b"#")
         && let Some(end) = memchr::memchr(b'\n', head)
@@ -143,9 +141,6 @@ fn is_parquet(head: &[u8]) -> bool {
 
 impl CsvLog {
     /// Reads a whole file: text, uncompressed or as gzip or zstd, or Parquet.
-    ///
-    /// # Errors
-    /// Like [`open`](Self::open).
     pub fn open_path(path: &Path, options: &CsvOptions) -> Result<Self, TableError> {
         let file = path.display();
         let source = super::lines::open(path, &std::sync::Arc::default());
@@ -155,11 +150,12 @@ impl CsvLog {
         Self::open(Box::new(lines.into_reader()), path, options)
     }
 
-    /// Reads the header and the first rows. `path` names the file in messages; a Parquet file is read from there.
+    /// Reads the header and the first rows. `path` names the file in messages. A Parquet file is read from `path`,
+    /// not from `source`.
     ///
     /// # Errors
-    /// Fails if the source cannot be read, a column is missing, values cannot be in the unit that the header states, or
-    /// the table of start times is faulty.
+    /// Fails if the source cannot be read, a column is missing, values contradict the stated unit, or the table of
+    /// start times is faulty.
     pub fn open(source: Box<dyn Read>, path: &Path, options: &CsvOptions) -> Result<Self, TableError> {
         let (table, preview) = open_table(source, path, options)?;
         let first = preview.first_rows(MAX_JUDGED_ROWS);
@@ -199,7 +195,7 @@ impl CsvLog {
         self.is_bdf
     }
 
-    /// What was read as what, and how many rows until now.
+    /// How the table was understood, and how many rows have been read.
     pub fn reading(&self) -> &TableReading {
         &self.reading
     }
@@ -211,9 +207,6 @@ impl CsvLog {
 
     /// Reads one row into [`values`](Self::values). Returns `None` at the end of the file, and an inner error if the
     /// row cannot be used.
-    ///
-    /// # Errors
-    /// Fails if the source fails.
     pub fn next_row(&mut self) -> Result<Option<Result<RowTime, TableError>>, TableError> {
         let Some((row, after)) = self.table.next_rows()? else { return Ok(None) };
         self.values.clear();
@@ -236,7 +229,7 @@ impl CsvLog {
         }
         self.last_time = Some(time);
         for &(channel, column) in &self.channels {
-            // The last line of a file may be torn, so its last number may be, too.
+            // The last line of a file may be cut off, and so may its last number.
             let is_torn = after.is_none() && row.bytes(column.index).is_none();
             let Some(value) = row.parsed(column.index).filter(|_| !is_torn) else {
                 return Ok(Some(Err(row.fault(column.index, NUMBER))));
@@ -285,7 +278,7 @@ fn unknown_state(sign: &CurrentSign, row: &Row<'_>, state: usize, current_a: f64
     (!is_known).then(|| row.fault(state, "charge, discharge or rest, because the current has no sign"))
 }
 
-/// Opens a table, and a second one for a look at the first rows.
+/// Opens the same table twice: once for reading it, once for a look at the first rows.
 fn open_table(source: Box<dyn Read>, path: &Path, options: &CsvOptions) -> Result<(Table, Table), TableError> {
     let mut magic = Vec::with_capacity(4);
     let mut source = source;
@@ -322,7 +315,7 @@ fn open_parquet(path: &Path) -> Result<(Table, Table), TableError> {
 }
 
 impl Sections {
-    /// Returns the time of a row. The row may be the first of a section.
+    /// Returns the time of a row. If the row begins a section, starts this section.
     fn place(&mut self, row: &Row<'_>, time: Timestamp) -> Result<RowTime, TableError> {
         let section = row.bytes(self.column).ok_or_else(|| row.fault(self.column, "a section"))?;
         let is_new = self.current.as_deref() != Some(section);
@@ -337,7 +330,6 @@ impl Sections {
     }
 }
 
-/// The section column, with the starts of the sections.
 fn sections(header: &Header, column: Option<usize>, options: &CsvOptions) -> Result<Option<Sections>, TableError> {
     let starts = match (&options.start_times, column) {
         (Some(path), Some(column)) => Some(read_starts(path, &header.names()[column])?),

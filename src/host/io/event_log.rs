@@ -44,7 +44,7 @@ pub fn write_head(out: &mut impl Write, vehicle: &VehicleIdentity) -> io::Result
 struct EventSum {
     reported: Option<Timestamp>,
     unreported: u64,
-    /// Shortest time between the latest log line and the next log line (s).
+    /// Minimum time between the latest log line and the next log line (s).
     period_s: f64,
 }
 
@@ -65,7 +65,6 @@ impl EventSum {
     }
 }
 
-/// The counts of one interface.
 #[derive(Debug, Clone, Copy, Default)]
 struct InterfaceSums {
     errors: EventSum,
@@ -279,7 +278,6 @@ fn log_poll(change: PollChange) {
     }
 }
 
-/// Logs a change of the cell model.
 fn log_model(kind: &EventKind) {
     let EventKind::Model { state, capacity_ah, capacity_std_ah, residual_v, chemistry, is_taken_back } = *kind else {
         return;
@@ -414,7 +412,6 @@ mod tests {
         assert!(rounded(f64::NAN).is_nan());
     }
 
-    /// Collects log lines.
     #[derive(Clone, Default)]
     struct Lines(std::sync::Arc<std::sync::Mutex<Vec<u8>>>);
 

@@ -15,12 +15,12 @@
 //! RELOAD (1700000000.600000000)
 //! ```
 //!
-//! `SECURED` is a frame of an authenticated message. The last field is the freshness value with which the authenticator
-//! was valid (`-`: the authenticator was not valid), so a replay needs no key. `RELOAD` means that another
-//! configuration applies after this line. The journal does not contain this configuration. `RESTORE` is the first line
-//! of a run that restored a stored state. `RESTORE` contains the downtime (`-`: the downtime follows from the stamps;
-//! `unknown`: the downtime is not known). If the last line has no line feed, a power cut has torn it. Such a line
-//! counts as a bad line, even if it can be parsed.
+//! `SECURED` is a frame of an authenticated message. The last field is the freshness value with which the
+//! authenticator was valid, so a replay needs no key (`-`: the authenticator was not valid). `RELOAD` means that
+//! another configuration applies after this line. The journal does not contain this configuration. `RESTORE` is the
+//! first line of a run that restored a stored state, and contains the downtime (`-`: it follows from the stamps;
+//! `unknown`: it is not known). If the last line has no line feed, a power cut interrupted it. Such a line counts as
+//! a bad line, even if it can be parsed.
 
 use std::io::{self, Write};
 
@@ -122,26 +122,17 @@ pub struct JournalWriter<W: Write> {
 
 impl<W: Write> JournalWriter<W> {
     /// Begins a journal. `interfaces` are the configured names in order.
-    ///
-    /// # Errors
-    /// Returns the errors of `out`.
     pub fn new(mut out: W, interfaces: Vec<String>) -> io::Result<Self> {
         writeln!(out, "{HEADER}")?;
         Ok(Self { out, interfaces })
     }
 
     /// Records that a stored state was restored and how old it was. Must precede every input.
-    ///
-    /// # Errors
-    /// Returns the errors of the file.
     pub fn restored(&mut self, now: Timestamp, away: Downtime) -> io::Result<()> {
         write_mark(&mut self.out, "RESTORE", now, format_args!(" {away}"))
     }
 
     /// Records that another configuration applies after this point.
-    ///
-    /// # Errors
-    /// Returns the errors of the file.
     pub fn reloaded(&mut self, time: Timestamp) -> io::Result<()> {
         write_mark(&mut self.out, "RELOAD", time, "")
     }
@@ -181,9 +172,6 @@ impl<W: Write> JournalWriter<W> {
     }
 
     /// Passes all written bytes to the operating system.
-    ///
-    /// # Errors
-    /// Returns the errors of the file.
     pub fn flush(&mut self) -> io::Result<()> {
         self.out.flush()
     }

@@ -18,10 +18,10 @@ use read_ahead::ReadAhead;
 /// bytes.
 const BLOCK: usize = 256 * 1024;
 
-/// Largest number of lines per byte of a compressed log. Logs of parked vehicles have up to 7 lines per byte, because each
-/// line has its own time; line feeds have 30,000.
+/// Maximum number of lines per byte of a compressed log. Logs of parked vehicles have up to 7 lines per byte, because
+/// each line has its own time. A file of line feeds has 30,000 lines per byte.
 const MAX_LINES_PER_BYTE: u64 = 50;
-/// Smaller compressed files may have as many lines as a file of this size, bytes.
+/// A compressed file smaller than this (bytes) may have as many lines as a file of this size.
 const MIN_PACKED: u64 = 4096;
 
 /// One line without its line feed.
@@ -45,9 +45,6 @@ pub fn open(path: &Path, read_bytes: &Arc<AtomicU64>) -> io::Result<Box<dyn Read
 }
 
 /// Like [`open`], for several files that together form one log.
-///
-/// # Errors
-/// Fails if the first file cannot be opened or its first bytes cannot be read.
 pub(super) fn open_parts(paths: &[PathBuf], read_bytes: &Arc<AtomicU64>) -> io::Result<Box<dyn Read>> {
     let is_standard_input = paths.iter().any(|path| path == Path::new("-"));
     let raw: Box<dyn Read + Send> =
@@ -68,13 +65,11 @@ pub(super) fn open_parts(paths: &[PathBuf], read_bytes: &Arc<AtomicU64>) -> io::
     Ok(Box::new(ReadAhead::new(ExpansionLimit { decoder, packed, lines: 0 }, BLOCK)?))
 }
 
-/// Ends a compressed file with far more lines than a log can have, because a few bytes would otherwise occupy the reader
-/// for minutes.
+/// Stops reading a compressed file that has far more lines than a log can have. Otherwise, a file of a few bytes
+/// could occupy the reader for minutes.
 struct ExpansionLimit {
     decoder: Box<dyn Read + Send>,
-    /// Bytes read from the compressed file.
     packed: Arc<AtomicU64>,
-    /// Lines that the decoder has returned.
     lines: u64,
 }
 
@@ -173,9 +168,6 @@ impl Lines {
 
     /// Returns the first line, without its line feed, and does not consume it. Must be called before any line is
     /// consumed. If the line is longer than the buffer, returns its beginning.
-    ///
-    /// # Errors
-    /// Returns the errors of the source.
     pub fn peek(&mut self) -> io::Result<&[u8]> {
         loop {
             let unread = self.start..self.end;
@@ -190,9 +182,6 @@ impl Lines {
 
     /// Returns the first bytes and does not consume them: at least `len` (at most 256 KiB) bytes, or the whole source
     /// if it is shorter. Must be called before any line is consumed.
-    ///
-    /// # Errors
-    /// Returns the errors of the source.
     #[cfg(feature = "formats")]
     pub(super) fn peek_bytes(&mut self, len: usize) -> io::Result<&[u8]> {
         while self.unread().len() < len.min(self.buffer.len()) && self.fill()? {}
@@ -210,7 +199,6 @@ impl Lines {
         self.start = 0;
     }
 
-    /// Reads more bytes. Returns `false` at the end of the source.
     fn fill(&mut self) -> io::Result<bool> {
         if self.ended {
             return Ok(false);

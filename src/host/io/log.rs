@@ -1,10 +1,10 @@
-//! Reads logs of any format as one stream of core inputs: journals, candump logs, logs of other tools and CSV,
-//! uncompressed or as gzip or zstd. Without the feature `formats`, only journals and candump logs are read.
+//! Reads logs of any format as one stream of core inputs: journals, candump logs, logs of other tools, and CSV. Logs
+//! may be compressed as gzip or zstd. Without the feature `formats`, only journals and candump logs are read.
 //!
 //! The first bytes decide the format; for CSV, the file name decides too. Several logs are read one after another on
 //! one clock. A log, or a CSV section without a start time, may begin before the latest record read so far. In that
-//! case, the log or section is moved to one second after this record, and an unknown gap is inserted before the log or
-//! section. [`LogCounts`] counts everything that does not become a record.
+//! case, it is moved to one second after this record, and an unknown gap is inserted before it. [`LogCounts`] counts
+//! everything that does not become a record.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::path::{Path, PathBuf};
@@ -66,7 +66,7 @@ pub struct LogCounts {
     pub first_bad_line: Option<String>,
     /// Lines without a record, such as headers, comments and blank lines.
     pub ignored_lines: u64,
-    /// The first of them that is not blank or a comment: file, line and text.
+    /// The first ignored line that is neither blank nor a comment: file, line and text.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub first_ignored_line: Option<String>,
     /// CAN XL frames, which are not supported.
@@ -88,9 +88,9 @@ pub struct LogCounts {
     /// How each log of another tool was read: file, format, and the interface of each channel.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub inputs: Vec<String>,
-    /// Segments of a journal that are missing before the first segment read (deleted or not given).
+    /// Number of missing segments of a journal before the first segment read (deleted or not given).
     pub deleted_segments: u64,
-    /// What was read of each table.
+    /// How each table was read.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub tables: Vec<TableReading>,
 }
@@ -282,7 +282,6 @@ impl LogSource {
         Ok(true)
     }
 
-    /// Updates the counts of the current table.
     fn note_table(&mut self) {
         if let Some(OpenLog { form: LogForm::Csv(log), .. }) = &self.current
             && let Some(last) = self.state.counts.tables.last_mut()

@@ -2,10 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-/// Rejects a file that is given twice.
-///
-/// # Errors
-/// Fails if a file is given twice.
+/// Checks that no file is given twice.
 pub fn check_distinct(files: &[PathBuf]) -> Result<(), String> {
     match files.iter().enumerate().find(|(index, file)| files[..*index].contains(file)) {
         Some((_, file)) => Err(format!("{}: named twice", file.display())),

@@ -1,36 +1,37 @@
-//! Judges whether readings are in the units that they are believed to be in.
+//! Judges whether readings are in their assumed units.
 //!
-//! In: times (s), currents (A) and voltages of a cell (V), which may be wrong by a factor. Out: an [`Implausible`] that
-//! names what is wrong and the unit that the values probably have. Readings that no rule contradicts pass: the rules
-//! state what no cell can do, not what a usual cell does. NaN means "no reading".
+//! In: times (s), currents (A) and voltages of a cell (V), which may be wrong by a factor. Out: an [`Implausible`]
+//! that names what is wrong and the unit that the values probably have. The rules state what no cell can do, not what
+//! a usual cell does. All other readings pass. NaN means "no reading".
 
-/// Largest plausible current, as multiple of the capacity per hour.
+/// Maximum plausible current, as a multiple of the capacity per hour.
 const MAX_C_RATE: f64 = 100.0;
 
-/// Largest plausible current if the capacity is unknown (A).
+/// Maximum plausible current if the capacity is unknown (A).
 const MAX_CURRENT_A: f64 = 2000.0;
 
-/// Largest plausible voltage of a cell (V). A module of four cells passes, because some tables call it a cell.
+/// Maximum plausible voltage of a cell (V). A module of four cells passes, because some tables call it a cell.
 const MAX_CELL_V: f64 = 20.0;
 
-/// Smallest plausible median voltage of a cell (V).
+/// Minimum plausible median voltage of a cell (V).
 const MIN_CELL_V: f64 = 0.5;
 
-/// Smallest and largest plausible product of a cell's resistance and capacity (ohm Ah). Usual cells have 0.02 to 0.5, so
-/// a factor of 1000 in the current is outside.
+/// Plausible range of a cell's resistance times its capacity (ohm Ah). Usual cells have 0.02 to 0.5, so a current
+/// that is wrong by a factor of 1000 is outside.
 const RESISTANCE_CAPACITY: (f64, f64) = (0.000_5, 20.0);
 
-/// Number of current steps that a judgement on the resistance or the sign needs.
+/// Minimum number of current steps for a judgement on the resistance or the sign.
 const MIN_STEPS: usize = 10;
 
-/// Share of readings beyond a limit above which a table is in the wrong unit. Fewer are faults of single readings.
+/// If a larger share of the readings is beyond a limit, the table is in the wrong unit. A smaller share consists of
+/// faults of single readings.
 const MAX_SHARE: f64 = 0.01;
 
-/// Largest plausible charge that a cell gives or takes without a return, as multiple of its capacity.
+/// Maximum plausible charge that a cell gives or takes in one direction, as a multiple of its capacity.
 const MAX_CAPACITIES: f64 = 3.0;
 
-/// Largest plausible change of the mean voltage, relative to the charge (V per capacity). At the ends of its curve a cell
-/// has up to 30.
+/// Maximum plausible change of the mean voltage, relative to the charge (V per capacity). At the ends of its curve, a
+/// cell reaches 30.
 const MAX_SLOPE_V: f64 = 40.0;
 
 /// Last plausible date: 2100-01-01 (s since 1970).
@@ -73,7 +74,7 @@ pub fn probable_stamp_unit(seconds: f64) -> Option<&'static str> {
     is_past.then(|| units.into_iter().find(|(factor, _)| seconds.abs() / factor <= LAST_DATE_S).map_or("ns", |of| of.1))
 }
 
-/// Unit of times that advance by `step_s` if they are read as seconds, but cannot be seconds.
+/// Probable unit of times that would advance by `step_s` as seconds, but cannot be seconds.
 fn probable_step_unit(step_s: f64) -> &'static str {
     // Rows are usually at most 100 s apart.
     [(1e3, "ms"), (1e6, "us")].into_iter().find(|(factor, _)| step_s / factor <= 100.0).map_or("ns", |of| of.1)
@@ -93,7 +94,7 @@ pub fn check_dates(time_s: &[f64]) -> Result<(), Implausible> {
 /// Checks the order of the times of rows (s).
 ///
 /// # Errors
-/// More than a fifth of the times are before the time of the previous row, or ten rows or more advance by less than 1 us
+/// More than a fifth of the times are before the previous row's time, or at least ten rows advance by less than 1 us
 /// each.
 pub fn check_order(time_s: &[f64]) -> Result<(), Implausible> {
     let known = || time_s.iter().copied().filter(|time_s| time_s.is_finite());
@@ -113,7 +114,6 @@ pub(super) fn longest_step(time_s: &[f64]) -> f64 {
     10.0 * median_step(time_s).unwrap_or_default()
 }
 
-/// The median step between times (s).
 pub(super) fn median_step(time_s: &[f64]) -> Option<f64> {
     median(&time_s.windows(2).map(|pair| pair[1] - pair[0]).collect::<Vec<_>>())
 }
@@ -130,9 +130,6 @@ pub fn check_currents(current_a: &[f64], size: PackSize) -> Result<(), Implausib
 }
 
 /// Checks voltages of a cell (V).
-///
-/// # Errors
-/// The voltages are impossible for a cell.
 pub fn check_voltages(cell_voltage_v: &[f64]) -> Result<(), Implausible> {
     if let Some(largest) = beyond(cell_voltage_v, MAX_CELL_V) {
         let probable = (1000.0..=1000.0 * MAX_CELL_V).contains(&largest).then_some("mV");
@@ -146,10 +143,10 @@ pub fn check_voltages(cell_voltage_v: &[f64]) -> Result<(), Implausible> {
     Ok(())
 }
 
-/// Checks a current by the voltage's answer to its steps, and by the charge that it moves.
+/// Checks a current by the response of the voltage to its steps, and by the charge that it moves.
 ///
 /// # Errors
-/// The current is wrong by a factor, or the times are.
+/// The current or the times are wrong by a factor.
 pub fn check_response(
     time_s: &[f64],
     current_a: &[f64],
@@ -177,12 +174,12 @@ pub fn check_response(
     check_charge(time_s, current_a, capacity_ah)
 }
 
-/// Checks that the charge stays within a few capacities. After a gap, in which a charge may be missing, it counts anew.
-/// Currents below a twentieth of the
-/// capacity per hour do not count: the offset of a sensor adds up over months.
+/// Checks that the charge stays within a few capacities. After a gap, the count restarts, because a charge may be
+/// missing. Currents below a twentieth of the capacity per hour do not count, because the offset of a sensor adds up
+/// over months.
 ///
 /// # Errors
-/// The current moves more than three capacities, and less than half a capacity back in between.
+/// The current moves more than three capacities in one direction, without moving half a capacity back in between.
 pub fn check_charge(time_s: &[f64], current_a: &[f64], capacity_ah: f64) -> Result<(), Implausible> {
     let longest_s = longest_step(time_s);
     let mut span_ah = 0.0_f64;
@@ -212,8 +209,8 @@ pub fn check_charge(time_s: &[f64], current_a: &[f64], capacity_ah: f64) -> Resu
     implausible("time", probable, what)
 }
 
-/// Checks that enough charge flows for the change of the mean voltage from one tenth of the rows to another. Only tenths
-/// with a mean current of the same sign count: after a load, the voltage recovers without a charge.
+/// Checks that enough charge flows to change the mean voltage from one tenth of the rows to another. Only tenths with
+/// a mean current of the same sign are compared, because after a load the voltage recovers without a charge.
 ///
 /// # Errors
 /// The voltage changes by more than 40 V per capacity.
@@ -251,22 +248,23 @@ pub fn check_slope(
     Ok(())
 }
 
-/// Direction of positive current that the voltage's answers to current steps show.
+/// Direction of positive current that the voltage shows in its responses to current steps.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ShownSign {
     /// The voltage falls when the current rises.
     Discharge,
     /// The voltage rises when the current rises.
     Charge,
-    /// Both occur often, and the current is never negative: the current is a magnitude.
+    /// The voltage often falls and often rises, and the current is never negative. The current is therefore a
+    /// magnitude.
     Magnitude,
-    /// Too few or contradictory answers.
+    /// Too few or contradictory responses.
     Unclear,
 }
 
-/// Finds the direction of positive current from the voltage's response to current steps. If the current has few steps,
-/// stretches of constant current also vote whose voltage changes by 100 mV or more. Stretches of a varying load do not
-/// vote, because the voltage may recover although the cell discharges.
+/// Finds the direction of positive current from the voltage's response to current steps. If there are few steps,
+/// stretches of constant current also count if their voltage changes by at least 100 mV. Stretches of a varying load
+/// do not count, because the voltage may recover although the cell discharges.
 pub fn shown_sign(time_s: &[f64], current_a: &[f64], cell_voltage_v: &[f64]) -> ShownSign {
     let largest = current_a.iter().copied().filter(|i| i.is_finite()).fold(0.0_f64, |max, i| max.max(i.abs()));
     let is_never_negative = current_a.iter().all(|&i| i.is_nan() || i >= -0.01 * largest);
@@ -291,8 +289,8 @@ pub fn shown_sign(time_s: &[f64], current_a: &[f64], cell_voltage_v: &[f64]) -> 
     if discharge > charge { ShownSign::Discharge } else { ShownSign::Charge }
 }
 
-/// Changes of current and voltage from row to row, of the rows that have both. Rows after a gap do not count: the recorder
-/// may have missed a charge.
+/// Changes of current and voltage between consecutive rows that have both. Changes across a gap are left out, because
+/// the recorder may have missed a charge.
 fn steps(time_s: &[f64], current_a: &[f64], voltage_v: &[f64]) -> Vec<(f64, f64)> {
     let rows = time_s
         .iter()
@@ -305,8 +303,8 @@ fn steps(time_s: &[f64], current_a: &[f64], voltage_v: &[f64]) -> Vec<(f64, f64)
     near.map(|pair| (pair[1][1] - pair[0][1], pair[1][2] - pair[0][2])).collect()
 }
 
-/// For each stretch of constant current: whether a positive current discharges. The voltage falls at a discharge and
-/// rises at a charge, by 100 mV or more.
+/// For each stretch of constant current, whether a positive current discharges. The voltage must change by at least
+/// 100 mV.
 fn plateaus(current_a: &[f64], voltage_v: &[f64], largest: f64) -> Vec<bool> {
     const MIN_ROWS: usize = 20;
     const SETTLING_ROWS: usize = 5;
@@ -317,7 +315,7 @@ fn plateaus(current_a: &[f64], voltage_v: &[f64], largest: f64) -> Vec<bool> {
         if is_constant && end < voltage_v.len() {
             continue;
         }
-        // A small current after a large one is no evidence: the voltage recovers.
+        // A small current after a large one is not evidence, because the voltage recovers.
         if end - start >= MIN_ROWS && current_a[start].abs() >= 0.15 * largest && largest > 0.0 {
             let stretch = &voltage_v[start + SETTLING_ROWS..end];
             let change_v = stretch[stretch.len() - 1] - stretch[0];
@@ -330,7 +328,7 @@ fn plateaus(current_a: &[f64], voltage_v: &[f64], largest: f64) -> Vec<bool> {
     votes
 }
 
-/// The largest value if more than 1 % of the values are beyond the limit.
+/// The largest value, if more than 1 % of the values are beyond the limit.
 fn beyond(values: &[f64], limit: f64) -> Option<f64> {
     let known = values.iter().filter(|value| value.is_finite()).count();
     let count = values.iter().filter(|value| value.abs() > limit).count();
@@ -338,7 +336,6 @@ fn beyond(values: &[f64], limit: f64) -> Option<f64> {
     (count > 0 && count as f64 > MAX_SHARE * known as f64).then_some(largest)
 }
 
-/// The median of the finite values.
 pub(super) fn median(values: &[f64]) -> Option<f64> {
     let mut known: Vec<f64> = values.iter().copied().filter(|value| value.is_finite()).collect();
     let middle = known.len() / 2;
@@ -380,7 +377,7 @@ mod tests {
         let found = |result: Result<(), Implausible>| result.err().map(|of| (of.quantity, of.probable));
         assert_eq!(found(check(&time, &current, &voltage)), None);
         assert_eq!(found(check(&time, &scaled(&current, 1000.0), &voltage)), Some(("current", Some("mA"))));
-        // 4 A as 40 C: only the voltage's answer shows it.
+        // Without the limit on the current, the response of the voltage alone shows the wrong unit.
         assert_eq!(
             found(check_response(&time, &scaled(&current, 1000.0), &voltage, SIZE)),
             Some(("current", Some("mA")))
@@ -404,7 +401,7 @@ mod tests {
         let cycles: Vec<f64> = (0..40_000).map(|n| if n / 100 % 2 == 0 { 1.5 } else { -1.47 }).collect();
         assert!(check(&minutes, &vec![0.1; 40_000]) && check(&minutes, &cycles));
         assert!(check(&[0.0, 60.0, 120.0, 360_000.0, 360_060.0], &[3.0; 5]) && !check(&minutes, &vec![1.0; 40_000]));
-        // A discharge in an hour, stated in minutes but read as seconds.
+        // A discharge in an hour. The file states the time in minutes, but it is read as seconds.
         let (time, current) = ((0..60).map(f64::from).collect::<Vec<_>>(), [3.0; 60]);
         let voltage: Vec<f64> = time.iter().map(|time| 4.1 - time / 60.0).collect();
         let slope =

@@ -12,11 +12,11 @@ use crate::monitor::MonitorConfig;
 use crate::quantity::BusIndex;
 use crate::sample::VoltageSource;
 
-/// Shortest default of the sleep gap (s).
+/// Minimum of the default sleep gap (s).
 const LEAST_SLEEP_GAP_S: f64 = 30.0;
 
-/// Default sleep gap (s). In a longer gap of a log, the recorder counts as asleep. While a current or a voltage is
-/// fresh, the recorder does not count as asleep.
+/// Default sleep gap (s). During a longer gap of a log, the recorder counts as asleep. The sleep gap is at least the
+/// maximum age of a current and of a voltage, so the recorder is not asleep while one of them is fresh.
 pub fn sleep_gap_s(config: &MonitorConfig) -> f64 {
     LEAST_SLEEP_GAP_S.max(config.sample.current.max_age_s).max(config.sample.voltage.max_age_s)
 }
@@ -62,7 +62,7 @@ impl LogReading {
     }
 }
 
-/// What a table of samples must fit: cells, sensors and size of the pack.
+/// The options that follow from the pack: cells, sensors and capacity.
 fn table_options(config: &MonitorConfig) -> CsvOptions {
     let sample = &config.sample;
     CsvOptions {

@@ -3,22 +3,19 @@
 use crate::monitor::Record;
 use crate::quantity::Timestamp;
 
-/// Content of an unused slot.
 pub(super) const UNUSED: Record = Record::tick(Timestamp::ZERO);
 
 /// Consecutive records in reused memory.
 #[derive(Debug)]
 pub struct Batch {
-    /// All slots.
     pub(super) slots: Box<[Record]>,
-    /// Number of filled slots.
     pub(super) len: usize,
     pub(super) carries_ticks: bool,
 }
 
 impl Batch {
-    /// Maximum number of records in a batch. These records take 12 KiB, so they fit into the first-level cache together
-    /// with the estimators.
+    /// Maximum number of records in a batch. They take 12 KiB and fit into the first-level cache together with the
+    /// estimators.
     pub const MAX: usize = 128;
 
     /// Creates a batch for up to `max` (1 to [`MAX`](Self::MAX)) records. If `max` is above 1, the source may have read

@@ -1,7 +1,7 @@
 //! Writes the result files of a command. A file is written completely or not at all, and every failure is reported.
 //!
-//! A regular file is written as `NAME.part` in the same folder and renamed when it is complete. If the command does not
-//! complete it, the part is deleted. `-` is standard output. A device or pipe is written directly.
+//! A regular file is written as `NAME.part` in the same folder and renamed when it is complete. If the command fails,
+//! `NAME.part` is deleted. `-` is standard output. A device or pipe is written directly.
 
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Seek, SeekFrom, Write};
@@ -79,9 +79,6 @@ impl Drop for ResultFile {
 }
 
 /// Writes a whole file.
-///
-/// # Errors
-/// Fails like [`ResultFile::create`] and [`ResultFile::finish`].
 pub fn write_file(path: &Path, bytes: &[u8]) -> io::Result<()> {
     let mut file = ResultFile::create(path)?;
     file.write_all(bytes)?;

@@ -7,10 +7,10 @@ use std::cell::Cell;
 use std::io::{Error, ErrorKind, Read, Result};
 use std::rc::Rc;
 
-/// Longest row, bytes, including bytes that are read ahead. The largest pack has 3,000 columns of 20 bytes.
+/// Maximum length of a row in bytes, including bytes that are read ahead. The largest pack has 3,000 columns of 20
+/// bytes.
 pub(super) const MAX_ROW_BYTES: usize = 1 << 20;
 
-/// A source that fails when a row is too long.
 pub(super) struct RowLimit {
     source: Box<dyn Read>,
     since_row: Rc<Cell<usize>>,
@@ -24,7 +24,6 @@ impl RowLimit {
     }
 }
 
-/// The error of a row that is too long.
 pub(super) fn too_long() -> Error {
     Error::new(ErrorKind::InvalidData, format!("row too long, must be at most {MAX_ROW_BYTES} bytes"))
 }

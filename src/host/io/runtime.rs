@@ -6,19 +6,18 @@ use std::os::unix::net::UnixStream;
 use nix::libc::EMFILE;
 use tokio::runtime::{Builder, Runtime};
 
-/// Pairs of sockets that a runtime opens at most: one for signals and one for waking, with a copy of each.
+/// Maximum number of socket pairs that a runtime opens: one for signals and one for waking, with a copy of each.
 const PAIRS: usize = 4;
 
 /// A runtime that runs everything on the calling thread.
 ///
 /// # Errors
-/// Fails if the process may not open enough descriptors. Tokio would panic when it opens the socket for signals.
+/// Fails if the process may not open enough descriptors. Without this check, Tokio would panic.
 pub fn new_runtime() -> io::Result<Runtime> {
     check_descriptors()?;
     Builder::new_current_thread().enable_all().build()
 }
 
-/// Checks that the descriptors of a runtime can be opened.
 pub(crate) fn check_descriptors() -> io::Result<()> {
     let pairs: io::Result<Vec<_>> = (0..PAIRS).map(|_| UnixStream::pair()).collect();
     pairs.map(drop).map_err(|error| match error.raw_os_error() {

@@ -1,11 +1,11 @@
 //! Writes and finds recordings in segments, which are compressed parts of one text. If their total size exceeds a
 //! limit, the oldest segments are deleted.
 //!
-//! `FILE` is written as `FILE.000001.zst`, `FILE.000002.zst` and so on. Each segment is a complete zstd frame with
-//! whole lines that begins with the text's header, so it can be read alone. Read one after another, the segments give
-//! the text with repeated headers, which the reader skips. A power cut tears only the last segment, which is readable
-//! up to its last flush. The segments of an earlier run become `FILE.1.000001.zst` and so on; the limit covers both
-//! runs.
+//! `FILE` is written as `FILE.000001.zst`, `FILE.000002.zst` and so on. Each segment is a complete zstd frame of
+//! whole lines, and begins with the text's header, so it can be read alone. Read one after another, the segments give
+//! the text with repeated headers, which the reader skips. A power cut damages only the last segment, which stays
+//! readable up to its last flush. The segments of an earlier run are renamed to `FILE.1.000001.zst` and so on. The
+//! limit covers both runs.
 
 use std::collections::VecDeque;
 use std::fs::{self, File};
@@ -16,10 +16,10 @@ use zstd::stream::write::Encoder;
 
 use super::place::with_suffix;
 
-/// Smallest and largest size of a segment, bytes. Smaller segments would be mostly headers; the deletion of a larger
-/// segment would lose days of recording.
+/// Minimum and maximum size of a segment, bytes. Smaller segments would be mostly headers. Deleting a larger segment
+/// would lose days of recording.
 pub const SEGMENT_BYTES: std::ops::RangeInclusive<u64> = 64 << 10..=4 << 30;
-/// Default size of a segment, bytes; a pack of 96 cells fills it in six hours.
+/// Default size of a segment, bytes. A pack of 96 cells fills it in six hours.
 pub const DEFAULT_SEGMENT_BYTES: u64 = 64 << 20;
 
 /// Size limits of a recording in segments.
@@ -33,9 +33,6 @@ pub struct SegmentLimits {
 
 impl SegmentLimits {
     /// Checks limits, which must allow at least two segments: the one being written and the one before it.
-    ///
-    /// # Errors
-    /// Returns an error that states the allowed values.
     pub fn new(total_bytes: u64, segment_bytes: u64) -> Result<Self, String> {
         if !SEGMENT_BYTES.contains(&segment_bytes) {
             let (least, greatest) = (SEGMENT_BYTES.start() >> 10, SEGMENT_BYTES.end() >> 30);
@@ -50,19 +47,17 @@ impl SegmentLimits {
     }
 }
 
-/// A segment on disk.
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct Segment {
     path: PathBuf,
     number: u64,
 }
 
-/// The path of segment `number` of `base`.
 fn path_of(base: &Path, number: u64) -> PathBuf {
     with_suffix(base, &format!(".{number:06}.zst"))
 }
 
-/// Base and number of a path that has the form of a segment's path.
+/// Splits a segment's path into base and number; `None` for other paths.
 fn parse(path: &Path) -> Option<(PathBuf, u64)> {
     let text = path.to_str()?.strip_suffix(".zst")?;
     let (base, digits) = text.rsplit_once('.')?;
@@ -71,7 +66,6 @@ fn parse(path: &Path) -> Option<(PathBuf, u64)> {
     Some((PathBuf::from(base), digits.parse().ok().filter(|_| is_number)?))
 }
 
-/// The segments of `base`, sorted by number.
 fn find(base: &Path) -> io::Result<Vec<Segment>> {
     let folder = base.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let mut segments = Vec::new();
@@ -124,10 +118,6 @@ pub(super) struct JoinedFiles {
 }
 
 impl JoinedFiles {
-    /// Opens the first file.
-    ///
-    /// # Errors
-    /// Fails if the first file cannot be opened, or if the list is empty.
     pub(super) fn open(paths: &[PathBuf]) -> io::Result<Self> {
         let mut rest: VecDeque<PathBuf> = paths.iter().cloned().collect();
         let first = rest.pop_front().ok_or(io::ErrorKind::NotFound)?;
@@ -148,7 +138,6 @@ impl Read for JoinedFiles {
     }
 }
 
-/// A file that counts the bytes written.
 #[derive(Debug)]
 struct CountedFile {
     file: File,
@@ -167,10 +156,8 @@ impl Write for CountedFile {
     }
 }
 
-/// Writes a recording in segments.
 pub(super) struct SegmentWriter {
     base: PathBuf,
-    /// First line of every segment.
     header: &'static str,
     limits: SegmentLimits,
     number: u64,
@@ -208,7 +195,6 @@ impl SegmentWriter {
         self.delete_oldest()
     }
 
-    /// Completes the last segment.
     pub(super) fn finish(mut self) -> io::Result<()> {
         self.open.do_finish()?;
         self.open.get_ref().file.sync_all()
@@ -235,9 +221,9 @@ impl SegmentWriter {
 }
 
 fn begin(path: &Path) -> io::Result<Encoder<'static, CountedFile>> {
-    // Compression level of zstd. This level shrinks frames of a pack of 96 cells by a factor of 8.0. Level 3 needs 2 MB
-    // more memory and gives a factor of 7.2. The vehicle's package (`packaging/debian/build`) leaves out the
-    // compressors of the other levels.
+    // This compression level of zstd shrinks frames of a pack of 96 cells by a factor of 8.0. Level 3 gives a factor
+    // of 7.2 and needs 2 MB more memory. The vehicle's package (`packaging/debian/build`) leaves out the compressors
+    // of the other levels.
     Encoder::new(CountedFile { file: File::create(path)?, bytes: 0 }, 1)
 }
 
@@ -257,7 +243,7 @@ fn keep_earlier(base: &Path) -> io::Result<VecDeque<(PathBuf, u64)>> {
     Ok(kept)
 }
 
-/// Deletes a file. A file that no longer exists is not an error.
+/// Deletes a file. If the file no longer exists, this is not an error.
 fn remove(path: &Path) -> io::Result<()> {
     fs::remove_file(path).or_else(|error| if error.kind() == io::ErrorKind::NotFound { Ok(()) } else { Err(error) })
 }

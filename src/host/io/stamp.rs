@@ -12,7 +12,8 @@ pub fn parse_seconds(text: &[u8]) -> Option<Timestamp> {
     })
 }
 
-/// Parses at most ten digits before and nine digits after the point exactly. Returns `None` for every other form.
+/// Parses a number without rounding. `None` if it has more than ten digits before or nine digits after the point, or
+/// another form.
 fn parse_exact(text: &[u8]) -> Option<Timestamp> {
     let (negative, digits) = match text.strip_prefix(b"-") {
         Some(rest) => (true, rest),
@@ -82,7 +83,6 @@ fn split_offset(time: &str) -> Option<(&str, i64)> {
     Some((time[..start].trim_end(), if time.as_bytes()[start] == b'-' { -seconds } else { seconds }))
 }
 
-/// Year, month and day of a date.
 fn parse_day(text: &str, is_day_first: bool) -> Option<(i64, i64, i64)> {
     const MONTHS: [&str; 12] = ["jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec"];
     let parts: Vec<&str> = text.split(['-', '/', '.']).collect();

@@ -9,12 +9,12 @@ use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::oneshot;
 use tokio::time::{Instant, sleep_until};
 
-/// Numbers of further signals that end a process by default, except those of crashes: SIGQUIT, SIGUSR1, SIGUSR2,
-/// SIGALRM, SIGSTKFLT, SIGXCPU, SIGVTALRM, SIGPROF, SIGIO, SIGPWR (Linux, except MIPS) and the signals for
-/// applications. The C library reserves the first real-time signals; catching those fails and is skipped.
+/// Numbers of further signals that end a process by default, without the signals of crashes: SIGQUIT, SIGUSR1,
+/// SIGUSR2, SIGALRM, SIGSTKFLT, SIGXCPU, SIGVTALRM, SIGPROF, SIGIO, SIGPWR (Linux, except MIPS) and the signals for
+/// applications. The C library reserves the first real-time signals. They cannot be caught and are skipped.
 const OTHERS: [std::ops::RangeInclusive<i32>; 9] =
     [3..=3, 10..=10, 12..=12, 14..=14, 16..=16, 24..=24, 26..=27, 29..=30, 34..=64];
-/// SIGXFSZ. The write that exceeded the limit then fails like any other write, and the daemon goes on.
+/// SIGXFSZ. If it is caught, a write that exceeds the limit fails like any other write, and the daemon continues.
 const FILE_SIZE: i32 = 25;
 
 /// Waits for the signal or time that ends the loop.
@@ -58,7 +58,6 @@ impl Stop {
     }
 }
 
-/// Waits for the first signal, and returns its number.
 async fn first(mut signals: Vec<(i32, Signal)>) -> i32 {
     poll_fn(|context| {
         let mut caught =

@@ -1,12 +1,14 @@
-//! Reads tables. Columns are found by name, rows are streamed, and every fault has its position.
+//! Reads tables: finds columns by name, streams rows, and reports the position of every fault.
 //!
-//! In: text with a header line, uncompressed or as gzip or zstd; with the feature `parquet` also Parquet files. Out:
-//! [`Row`]s whose fields are read as text, numbers or stamps. Fields are separated by commas, semicolons, tabs or bars.
-//! Except between commas, a number may have a decimal comma. The text is UTF-8 or UTF-16. Blanks around fields and a
-//! byte order mark are removed. A second header line may state the units. Rows may be shorter or longer than the
-//! header; a missing field counts as empty. A row of more than a megabyte ends the reading. The message of a fault is
-//! `FILE:LINE: column NAME: found X, must be ALLOWED`. A fault does not end the reading, so the caller may skip the
-//! row. Control characters in names are escaped.
+//! In: text with a header line, uncompressed or as gzip or zstd; with the feature `formats` also Parquet files. Out:
+//! [`Row`]s whose fields are read as text, numbers or stamps.
+//!
+//! The text is UTF-8 or UTF-16. Fields are separated by commas, semicolons, tabs or bars. If the separator is not a
+//! comma, a number may have a decimal comma. Blanks around fields and a byte order mark are removed. A second header
+//! line may state the units. Rows may be shorter or longer than the header; a missing field counts as empty.
+//!
+//! A row of more than a megabyte ends the reading. Other faults do not, so the caller may skip the row. The message
+//! of a fault is `FILE:LINE: column NAME: found X, must be ALLOWED`. Control characters in names are escaped.
 
 use std::borrow::Cow;
 use std::cell::Cell;
@@ -55,12 +57,11 @@ impl TableError {
 pub enum Quotes {
     /// Quotes may enclose fields that hold commas or line breaks.
     Enclose,
-    /// Every line is a row. Otherwise, one stray quote would swallow all later rows. Within a line, quotes may enclose
-    /// fields that hold separators. Quotes around a whole number or column name are removed.
+    /// Every line is a row, so a stray quote cannot swallow later rows. Within a line, quotes may enclose fields that
+    /// contain separators. Quotes around a whole number or column name are removed.
     Literal,
 }
 
-/// Number of columns that a message lists.
 const MAX_LISTED_COLUMNS: usize = 64;
 
 /// A table being read.
@@ -68,18 +69,15 @@ pub struct Table {
     rows: Rows,
     record: csv::ByteRecord,
     next: csv::ByteRecord,
-    /// Line of `next`, or why it could not be read; `None` = `next` is not read yet.
+    /// Line of `next`, or why it could not be read; `None` = `next` has not been read.
     ahead: Option<Result<Option<u64>, TableError>>,
     header: Header,
 }
 
-/// The source of the rows.
 enum Rows {
     Text {
         reader: csv::Reader<RowLimit>,
-        /// Bytes read since the last row.
         since_row: Rc<Cell<usize>>,
-        /// Number of lines before the first row.
         lines_before: u64,
         /// The separator, if quotes enclose fields only within a line.
         rejoined: Option<u8>,
@@ -94,12 +92,11 @@ pub struct Header {
     file: String,
     line: u64,
     names: Vec<String>,
-    /// Units in a line of their own; empty = no such line.
+    /// Units from a separate line; empty = no such line.
     units: Vec<String>,
     has_decimal_comma: bool,
 }
 
-/// The first rows of a table.
 pub(super) struct FirstRows {
     pub(super) header: Header,
     records: Vec<csv::ByteRecord>,
@@ -122,9 +119,6 @@ pub struct Row<'t> {
 
 impl Table {
     /// Opens a file and reads its header. `-` is standard input.
-    ///
-    /// # Errors
-    /// Fails if the file cannot be read.
     pub fn open(path: &Path) -> Result<Self, TableError> {
         let file = path.display().to_string();
         let source = lines::open(path, &Arc::default());
@@ -133,18 +127,13 @@ impl Table {
     }
 
     /// Reads the header of decompressed text, which is its first line. `file` is the name in messages.
-    ///
-    /// # Errors
-    /// Fails if the source cannot be read.
     pub fn new(source: Box<dyn Read>, file: String, quotes: Quotes) -> Result<Self, TableError> {
         Self::find(source, file, quotes, &|_| 0).map(|(table, _)| table)
     }
 
-    /// Reads the header of decompressed text, which may follow other lines. `score` rates the fields of a line: 0 = not
-    /// a header, else higher = more known columns. Also returns a table of the first rows, which does not consume rows.
-    ///
-    /// # Errors
-    /// Fails if the source cannot be read.
+    /// Reads the header of decompressed text. Other lines may precede the header. `score` rates the fields of a line:
+    /// 0 = not a header, higher = more known columns. Also returns a second table for a look at the first rows, which
+    /// does not consume rows of the first table.
     pub(super) fn find(
         source: Box<dyn Read>,
         file: String,
@@ -203,10 +192,7 @@ impl Table {
         Self { rows, record, next, ahead: None, header }
     }
 
-    /// Opens a Parquet file, and the same file again for a look at its first rows.
-    ///
-    /// # Errors
-    /// Fails if the file cannot be read.
+    /// Opens a Parquet file twice: once for reading it, once for a look at its first rows.
     #[cfg(feature = "formats")]
     pub(super) fn open_parquet(path: &Path) -> Result<(Self, Self), TableError> {
         let open = || {
@@ -244,9 +230,6 @@ impl Table {
     }
 
     /// The next row, and the row after it, if it can be read.
-    ///
-    /// # Errors
-    /// Fails like [`next_row`](Self::next_row).
     pub(super) fn next_rows(&mut self) -> Result<Option<(Row<'_>, Option<Row<'_>>)>, TableError> {
         let Some(line) = self.next_row()?.map(|row| row.line) else { return Ok(None) };
         self.ahead = Some(self.read());
@@ -255,7 +238,6 @@ impl Table {
         Ok(Some((row(line, &self.record), after)))
     }
 
-    /// Reads a row into `next`. Returns its line.
     fn read(&mut self) -> Result<Option<u64>, TableError> {
         let (more, line) = match &mut self.rows {
             Rows::Text { reader, since_row, lines_before, rejoined } => {
@@ -283,8 +265,8 @@ pub(super) fn has_header(head: &[u8], score: &dyn Fn(&[String]) -> usize) -> boo
     text::form(head, score).is_known
 }
 
-/// Joins the parts of quoted fields that hold separators, and removes blanks around fields. A quote without an end
-/// stays.
+/// Joins the parts of quoted fields that contain separators, and removes blanks around fields. A quote without an end
+/// is kept.
 fn join_quoted(record: &mut csv::ByteRecord, separator: u8) {
     if record.iter().any(text::opens_quote) {
         let parts: Vec<&[u8]> = record.iter().collect();
@@ -293,18 +275,17 @@ fn join_quoted(record: &mut csv::ByteRecord, separator: u8) {
     record.trim();
 }
 
-/// Number of line feeds.
 fn lines_in(bytes: &[u8]) -> u64 {
     memchr::memchr_iter(b'\n', bytes).count() as u64
 }
 
-/// The name of a column, without quotes, for messages and as key.
+/// The name of a column without quotes, for messages and as a key.
 fn name_of(field: &[u8]) -> String {
     let text = String::from_utf8_lossy(field);
     escaped(text.trim_start_matches('\u{feff}').trim_matches('"'))
 }
 
-/// Replaces characters that act on a terminal or reverse the text by their escapes.
+/// Escapes characters that control a terminal or reverse the text.
 pub(super) fn escaped(text: &str) -> String {
     let acts = |c: char| {
         c.is_control()
@@ -317,7 +298,7 @@ pub(super) fn escaped(text: &str) -> String {
     out
 }
 
-/// Whether a row states units, such as `s,mA,[V]`: it has two units or more, and no digits.
+/// Whether a row states units, such as `s,mA,[V]`: it has at least two units and no digits.
 fn is_unit_row(record: &csv::ByteRecord) -> bool {
     let has_digit = record.iter().any(|field| field.iter().any(u8::is_ascii_digit));
     let bare = |field: &[u8]| String::from_utf8_lossy(field).trim_matches(['[', ']', '(', ')', '"', ' ']).to_owned();
@@ -343,12 +324,11 @@ impl Header {
         &self.names
     }
 
-    /// The unit of a column if a line of its own states the units; empty if unknown.
+    /// The unit of a column from a separate line of units; empty if unknown.
     pub(super) fn unit_text(&self, column: usize) -> &str {
         self.units.get(column).map_or("", String::as_str)
     }
 
-    /// The columns for messages, at most 64.
     pub(super) fn listed(&self) -> String {
         let mut text = self.names[..self.names.len().min(MAX_LISTED_COLUMNS)].join(",");
         if self.names.len() > MAX_LISTED_COLUMNS {
@@ -368,9 +348,6 @@ impl Header {
     }
 
     /// Index of the first of these columns that the table has.
-    ///
-    /// # Errors
-    /// Fails if the table has none of these columns.
     pub fn required(&self, names: &[&str]) -> Result<usize, TableError> {
         let missing = || self.fault(format!("no column {}, found {}", names.join(" or "), self.listed()));
         self.find_any(names).ok_or_else(missing)
@@ -399,9 +376,6 @@ impl<'t> Row<'t> {
     }
 
     /// A finite number; `None` for an empty field.
-    ///
-    /// # Errors
-    /// Fails if the field is neither a finite number nor empty.
     pub fn number(&self, column: usize) -> Result<Option<f64>, TableError> {
         self.number_in(column, f64::MIN..=f64::MAX, "a finite number, empty, - or n/a")
     }
@@ -428,14 +402,11 @@ impl<'t> Row<'t> {
         if value.is_some() || !self.header.has_decimal_comma || !field.contains(&b',') {
             return value;
         }
-        // A decimal comma. Several commas separate thousands, which is not a number here.
+        // Read a decimal comma. Several commas separate thousands, which is not a number here.
         parse_field(&field.iter().map(|&byte| if byte == b',' { b'.' } else { byte }).collect::<Vec<_>>())
     }
 
     /// A point in time: a date, or seconds.
-    ///
-    /// # Errors
-    /// Fails if the field is neither a date nor seconds.
     pub fn stamp(&self, column: usize) -> Result<Timestamp, TableError> {
         stamp::parse_stamp(&self.text(column)).ok_or_else(|| self.fault(column, STAMP))
     }

@@ -6,7 +6,7 @@ pub fn printable(text: &str) -> String {
     let mut safe = String::with_capacity(text.len());
     for c in text.chars() {
         if c.is_control() && !matches!(c, '\n' | '\t') {
-            // As in JSON and TOML.
+            // The escape has the same form as in JSON and TOML.
             safe.extend(format!("\\u{:04x}", u32::from(c)).chars());
         } else {
             safe.push(c);

@@ -21,7 +21,6 @@ use crate::quantity::Timestamp;
 pub struct Ticks {
     period_ns: i64,
     sleep_gap_ns: i64,
-    /// Time of the next tick.
     next_ns: i64,
     /// Ticks before this time may be popped.
     limit_ns: i64,

@@ -9,7 +9,6 @@ use packwatch_formats::{Channel, Format, Item, LogReader, Position, Source};
 use super::lines::Lines;
 use crate::quantity::BusIndex;
 
-/// An open log of another tool.
 pub(super) struct ToolLog {
     reader: Box<dyn LogReader>,
     /// Interface of each channel seen so far; `None` = not configured.
@@ -25,7 +24,8 @@ impl ToolLog {
     pub(super) fn recognise(lines: &mut Lines) -> io::Result<Option<Format>> {
         let first = lines.peek()?;
         if first.starts_with(b"PACKWATCH-JOURNAL") || begins_with_unix_stamp(first) {
-            // A journal or a candump log. A live source must not wait until it has sent a whole head.
+            // This is a journal or a candump log. Return early, because a live source may take long to send a whole
+            // head.
             return Ok(None);
         }
         let head = lines.peek_bytes(Format::HEAD_BYTES)?;
@@ -36,10 +36,6 @@ impl ToolLog {
         }
     }
 
-    /// Opens a log of a recognised format.
-    ///
-    /// # Errors
-    /// Fails if the source cannot be read or its header is damaged.
     pub(super) fn open(format: Format, mut lines: Lines, paths: &[PathBuf]) -> io::Result<Self> {
         let file = match paths {
             [path] => plain_file(path, lines.peek_bytes(Format::HEAD_BYTES)?)?,
@@ -68,7 +64,6 @@ impl ToolLog {
         self.buses.get(usize::from(channel)).copied().flatten()
     }
 
-    /// Name of a channel, for messages.
     pub(super) fn channel_name(&self, channel: u8) -> String {
         match self.reader.channels().get(usize::from(channel)) {
             Some(Channel::Name(name)) => name.clone(),

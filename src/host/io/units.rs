@@ -41,7 +41,7 @@ pub struct Unit {
     pub quantity: Quantity,
     /// Symbol for messages.
     pub symbol: &'static str,
-    /// Value of this unit at which the base unit is 0.
+    /// Value in this unit that equals 0 in the base unit.
     zero: f64,
     multiply: f64,
     divide: f64,
@@ -112,7 +112,7 @@ impl Unit {
         let mut plain: String = text.trim().to_lowercase().replace(['\u{b5}', '\u{3bc}'], "u");
         plain = plain.replace('\u{2103}', "c").replace('\u{2109}', "f");
         plain.retain(|c| !matches!(c, ' ' | '.' | '\u{b7}' | '*' | '^'));
-        // The sign of a degree in UTF-8, as ordinal, and as a byte of another encoding.
+        // The degree sign in UTF-8, as an ordinal indicator, and as a byte of another encoding.
         for (sign, ends) in [('\u{b0}', ""), ('\u{ba}', ""), ('\u{f8}', ""), ('\u{fffd}', "cfk")] {
             if let Some(rest) = plain.strip_prefix(sign).or_else(|| plain.strip_prefix(&format!("\u{c2}{sign}")))
                 && (ends.is_empty() || (rest.len() == 1 && ends.contains(rest)))
@@ -126,7 +126,7 @@ impl Unit {
 
     /// The base unit of a quantity.
     pub fn base(quantity: Quantity) -> &'static Self {
-        // Every quantity has a unit, so the first unit of the table is never used in its place.
+        // Every quantity has a unit, so the fallback is never used.
         UNITS.iter().find(|unit| unit.quantity == quantity).unwrap_or(&UNITS[0])
     }
 
@@ -135,12 +135,13 @@ impl Unit {
         (value - self.zero) * self.multiply / self.divide
     }
 
-    /// Number of this unit that make one of the base unit; for messages on a wrong factor.
+    /// How many of this unit make one base unit, for messages about a wrong factor.
     pub(super) fn per_base(&self) -> f64 {
         self.divide / self.multiply
     }
 
-    /// Length of this unit of time (ns); `None` for another quantity, and for Excel's days, which do not begin in 1970.
+    /// Length of this unit of time (ns). `None` for other quantities, and for Excel's days, which do not begin in
+    /// 1970.
     pub(super) fn nanos(&self) -> Option<i64> {
         (self.quantity == Quantity::Time && self.zero == 0.0).then_some((1e9 * self.multiply / self.divide) as i64)
     }

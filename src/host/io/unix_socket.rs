@@ -1,6 +1,6 @@
-//! Opens and deletes Unix sockets and their files. When a daemon opens a socket whose file already exists, it replaces
-//! the file if the daemon that created it has ended. If that daemon still runs, the file is kept and opening fails.
-//! [`explain_no_daemon`] is the message of a client that finds no daemon.
+//! Opens and deletes Unix sockets and their files. If the file of a socket exists and the daemon that created it has
+//! ended, the file is replaced. If that daemon still runs, opening fails. [`explain_no_daemon`] is the message for a
+//! client that finds no daemon.
 
 use std::fs::Permissions;
 use std::io::{self, ErrorKind};
@@ -51,7 +51,6 @@ pub fn explain_no_daemon(path: &Path, socket: &str, standard: &Path, setting: &s
     )
 }
 
-/// Names the kind of a file that is not a socket. `None` = the file is a socket or does not exist.
 fn other_file(path: &Path) -> Option<&'static str> {
     let kind = std::fs::metadata(path).ok()?.file_type();
     match (kind.is_socket(), kind.is_file(), kind.is_dir()) {
@@ -63,7 +62,7 @@ fn other_file(path: &Path) -> Option<&'static str> {
 }
 
 /// Creates the folder of `path` if it is the default folder and systemd has not created it. If this fails, the bind
-/// fails too and is reported.
+/// also fails and reports an error.
 fn make_default_folder(path: &Path) {
     let Some(folder) = path.parent().filter(|folder| *folder == runtime_folder()) else { return };
     if first_folder("RUNTIME_DIRECTORY").is_none() && std::fs::create_dir(folder).is_ok() {
@@ -102,8 +101,8 @@ impl From<io::Error> for BindError {
 }
 
 impl BindError {
-    /// Decides whether the server with option `--OPTION` continues without its socket. If so, the reason is logged and
-    /// the result is `None`.
+    /// Decides whether the server with option `--OPTION` continues without its socket. If so, logs the reason and
+    /// returns `None`.
     ///
     /// # Errors
     /// Fails if another daemon uses the socket, or the socket is required.
@@ -154,7 +153,6 @@ async fn remove_stale(path: &Path) -> Result<(), BindError> {
     }
 }
 
-/// Describes the process that listens, as reported by the kernel.
 fn owner(stream: &UnixStream) -> String {
     match stream.peer_cred() {
         Ok(who) => {

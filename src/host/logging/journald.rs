@@ -15,7 +15,6 @@ use tracing_subscriber::layer::{Context, Layer};
 
 use super::note_left_out;
 
-/// The socket of journald.
 const SOCKET: &str = "/run/systemd/journal/socket";
 /// Longest value, bytes. Longer values are cut. An entry with a few values of this length fits into a datagram.
 const MAX_VALUE: usize = 8 * 1024;
@@ -26,7 +25,6 @@ const MESSAGE_IDS: [(&str, &str); 3] = [
     ("configuration rejected, the old one stays", "870d888fffdd45d08f0fbc3c3a1489e9"),
 ];
 
-/// The socket that sends entries to journald.
 #[derive(Debug)]
 pub(super) struct Journal {
     socket: UnixDatagram,
@@ -81,7 +79,6 @@ fn entry(event: &Event<'_>) -> Vec<u8> {
     entry
 }
 
-/// The syslog priority.
 fn priority(level: Level) -> &'static str {
     match level {
         Level::ERROR => "3",
@@ -113,7 +110,6 @@ fn put(entry: &mut Vec<u8>, name: &str, value: &str) {
     entry.push(b'\n');
 }
 
-/// An event's text and fields.
 #[derive(Debug, Default)]
 struct EventText {
     message: String,

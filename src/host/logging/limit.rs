@@ -3,8 +3,8 @@
 //!
 //! A bus that changes state all day must not wear out the flash memory. Each place in the program that logs has its own
 //! kind of line. A thousand lines about cells therefore do not suppress the line about an interface. Some lines are
-//! never dropped: lines about alarms, which the rules debounce, the line with the count, and lines of the levels
-//! `debug` and `trace`, which are logged only on request.
+//! never dropped: lines about alarms (the rules debounce alarms), the line with the count, and lines of the levels
+//! `debug` and `trace` (they are logged only on request).
 
 use std::collections::HashMap;
 use std::sync::Mutex;

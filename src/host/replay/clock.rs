@@ -22,7 +22,6 @@ impl LogTime {
     }
 }
 
-/// The selected part of the log.
 pub(super) struct TimeWindow {
     from: Option<LogTime>,
     pub(super) until: Option<LogTime>,
@@ -60,7 +59,7 @@ pub(super) struct RecordSpan {
     pub(super) latest: Option<Timestamp>,
     /// Covered time without gaps longer than the sleep gap. Nanoseconds keep the sum of millions of steps exact.
     awake_ns: i64,
-    /// Number of steps to a later stamp, and how many of them are longer than the sleep gap.
+    /// Number of records with a later stamp than all records before them, and how many of them follow a sleep gap.
     steps: u64,
     gaps: u64,
     pub(super) started: Instant,
@@ -95,7 +94,7 @@ impl RecordSpan {
         asleep
     }
 
-    /// Number of steps to a later stamp that are longer than the sleep gap, and of all steps.
+    /// Number of records that follow a sleep gap, and number of all records with a later stamp than before.
     pub(super) fn gaps_and_steps(&self) -> (u64, u64) {
         (self.gaps, self.steps)
     }

@@ -1,9 +1,7 @@
-//! Drives a monitor. The caller feeds it rows of values or frames, and the driver adds the ticks of a replay between
-//! them.
+//! Drives a monitor with rows of values or with frames, and adds the periodic ticks between them, as a replay does.
 //!
-//! In: rows or frames, with their times. Rows are in A (positive = discharge), V and degrees C. Out: the monitor's
-//! [`Outputs`], which the caller clears. Guarantee: `packwatch replay` with a log of the same inputs gives the same
-//! outputs.
+//! Rows are in A (positive = discharge), V and degrees C. The outputs are the monitor's [`Outputs`], which the caller
+//! clears. Guarantee: `packwatch replay` with a log of the same inputs gives the same outputs.
 
 use crate::can::Frame;
 use crate::can::decode::Channel;
@@ -12,10 +10,9 @@ use crate::io::ticks::Ticks;
 use crate::monitor::{Monitor, MonitorConfig, Outputs, Record, TICK_PERIOD_MS};
 use crate::quantity::{BusIndex, Timestamp};
 
-/// A monitor, its ticks, and the encoder of rows.
+/// A monitor, its ticks, and the encoder that turns rows into frames.
 #[derive(Debug)]
 pub struct MonitorDriver {
-    /// The monitor.
     pub monitor: Monitor,
     row_frames: RowFrames,
     ticks: Ticks,

@@ -77,7 +77,7 @@ fn mostly_refused(summary: &ReplaySummary, readings: &ReadingCounts) -> Option<S
     })
 }
 
-/// The recorder counts as asleep in a gap longer than the sleep gap, so nothing is counted during such a gap.
+/// During a gap longer than the sleep gap, the recorder counts as asleep, and nothing is computed.
 fn mostly_asleep(span: &RecordSpan) -> Option<String> {
     let (gaps, steps) = span.gaps_and_steps();
     (2 * gaps > steps && steps > 1).then(|| {

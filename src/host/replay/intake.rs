@@ -23,7 +23,6 @@ pub struct ProtectedSummary {
 /// Counts of protected messages, dropped frames and diagnostic answers.
 type Summaries = (Vec<ProtectedSummary>, Vec<MessageFlood>, Vec<ControllerStatus>);
 
-/// The counts of a monitor's protected messages, dropped frames and diagnostic answers.
 pub(super) fn summaries(monitor: &Monitor, interfaces: &[String]) -> Summaries {
     let name = |bus: BusIndex| interfaces.get(bus.index()).map_or("unknown", String::as_str).to_owned();
     let protected = monitor.protected().map(|of| ProtectedSummary {

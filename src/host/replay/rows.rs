@@ -26,7 +26,6 @@ pub const ESTIMATE_COLUMNS: [&str; 17] = [
     "temperature_c",
 ];
 
-/// Writes the column names.
 pub(super) fn write_estimates_header(out: &mut impl Write) -> io::Result<()> {
     writeln!(out, "{}", ESTIMATE_COLUMNS.join(","))
 }
@@ -57,7 +56,6 @@ fn write_value(out: &mut impl Write, value: f64) -> io::Result<()> {
     if value.is_nan() { out.write_all(b",") } else { write!(out, ",{value:?}") }
 }
 
-/// Writes one candump line.
 pub(super) fn write_frame(out: &mut impl Write, interfaces: &[String], transmit: &Transmit) -> io::Result<()> {
     let interface = interfaces.get(transmit.bus.index()).map_or("unknown", String::as_str);
     candump::write_line(out, transmit.time, StampDigits::Nanos, interface, &transmit.frame)

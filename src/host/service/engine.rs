@@ -35,7 +35,6 @@ pub(super) struct Engine {
     pub(super) outputs: Outputs,
     /// Sending ends of the interfaces; empty before the start and after the stop.
     pub(super) links: Vec<LinkOutput>,
-    /// Key of authenticated frames.
     key: Option<CanKey>,
     record: Option<JournalWriter<BackgroundFile>>,
     frames: Option<BackgroundFile>,
@@ -44,9 +43,7 @@ pub(super) struct Engine {
     log: EventLog,
     /// Whether a file could not be written and was therefore closed.
     has_lost_file: bool,
-    /// State and history.
     store: Option<Store>,
-    /// Whether the store can be written.
     store_works: bool,
     /// Whether the disk has room for more than urgent data.
     has_room: bool,
@@ -60,7 +57,7 @@ pub(super) struct Engine {
     pub(super) recent: RecentEvents,
     /// Progress of the store; `None` = no progress was reported.
     progress: Option<StoreProgress>,
-    /// How often results were announced before they were stored.
+    /// Number of times that results were announced before they were stored.
     late: u64,
 }
 
@@ -197,7 +194,6 @@ impl Engine {
         self.store.as_ref().map(Store::progress)
     }
 
-    /// Handles progress or failure of the store.
     pub(super) fn handle_store_progress(&mut self, progress: StoreProgress, time: Timestamp) {
         self.barrier.release(progress.ticket, |transmit| send(&self.links, self.key.as_ref(), transmit));
         (self.store_works, self.has_room) = (progress.works, progress.has_room);
@@ -206,7 +202,6 @@ impl Engine {
         self.report_store_health(time);
     }
 
-    /// The store's status, for the status document.
     pub(super) fn store_status(&self) -> Option<StoreStatus> {
         let path = match &self.store {
             Some(store) => store.folder().display().to_string(),
@@ -258,7 +253,7 @@ impl Engine {
         }
     }
 
-    /// If frames are authenticated, stores the state of the start. The caller sends no frame before.
+    /// If frames are authenticated, stores the state at the start. The caller must not send frames before this call.
     pub(super) fn store_start(&mut self, time: Timestamp) {
         if self.key.is_some()
             && let Some(store) = &mut self.store
@@ -267,7 +262,6 @@ impl Engine {
         }
     }
 
-    /// Queues a checkpoint.
     #[cfg(test)]
     pub(super) fn write_checkpoint(&mut self, time: Timestamp) {
         if let Some(store) = &mut self.store {
@@ -275,7 +269,6 @@ impl Engine {
         }
     }
 
-    /// Waits until everything queued is on disk, and handles the result.
     #[cfg(test)]
     pub(super) fn settle_store(&mut self, time: Timestamp) -> Option<StoreProgress> {
         let progress = self.store.as_ref()?.settle();
@@ -283,7 +276,6 @@ impl Engine {
         Some(progress)
     }
 
-    /// Writes the last state to disk.
     pub(super) fn close_store(&mut self, time: Timestamp) {
         if let Some(store) = self.store.take() {
             store.finish(&self.monitor, time);

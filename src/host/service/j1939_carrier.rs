@@ -1,6 +1,5 @@
-//! Logs that packwatch runs its own J1939 stack on raw CAN. packwatch does not use the kernel's stack, so that a replay
-//! produces the same frames. The log line also states whether the kernel's stack is loaded, for users who look for the
-//! node there.
+//! Logs that packwatch runs its own J1939 stack on raw CAN, so that a replay produces the same frames. For users who
+//! look for the node in the kernel, the log line states whether the kernel's own stack is loaded.
 
 /// Logs one line. A kernel that loads its J1939 stack on first use lists the stack only after that use.
 pub(super) fn log_kernel_stack() {

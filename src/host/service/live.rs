@@ -29,18 +29,17 @@ use crate::store::StoreProgress;
 const BATCH: usize = 256;
 /// If the loop has not run for longer than this time, its process was stopped (by SIGSTOP or a debugger), or the
 /// computer was overloaded. The sockets then hold frames of a long time, which must be merged before they are handled.
-/// The time is the largest step back that the core accepts from frames merged out of order.
+/// The limit equals the largest step back in time that the core accepts from frames merged out of order.
 const MAX_PAUSE_NS: i64 = MERGE_TOLERANCE_NS;
-/// Pause between two attempts to collect these frames.
+/// Pause between two attempts to collect the frames that arrived during a stop.
 const MERGE_ROUND: Duration = Duration::from_millis(10);
-/// Maximum number of attempts. Collecting ends with the first attempt that finds no frame from the time of the stop.
+/// Maximum number of attempts. Collecting ends earlier if an attempt finds no frame from the time of the stop.
 const MERGE_ROUNDS: usize = 100;
 /// Maximum number of records that are merged after a stop. All sockets together hold fewer.
 const MAX_MERGED: usize = 1 << 20;
 /// Time for the interfaces to send queued frames when the daemon stops.
 const DRAIN_LIMIT: Duration = Duration::from_millis(500);
 
-/// The service loop.
 #[derive(Debug)]
 pub(super) struct ServiceLoop {
     pub(super) engine: Engine,
@@ -98,7 +97,7 @@ impl ServiceLoop {
                 Some((task, findings)) = next_model_fit(&mut self.model_fit) => {
                     self.engine.monitor.give_model_fit(task, findings);
                 }
-                // At most one request per connection waits.
+                // Each connection has at most one waiting request.
                 Some(request) = self.requests.recv() => self.answer(request).await,
                 // At most one configuration a second is read.
                 step = self.reload.next() => self.handle_reload(step).await,
@@ -112,7 +111,6 @@ impl ServiceLoop {
         }
     }
 
-    /// Logs a step of the wall clock.
     fn log_clock_step(&mut self) {
         if let Some(seconds) = self.clock_steps.step_s(Reading::now()) {
             tracing::warn!(
@@ -187,7 +185,7 @@ impl ServiceLoop {
     }
 
     /// Handles the input that was received before the command, then passes the command to the core. Returns the outcome
-    /// and the ticket of the commit.
+    /// and the ticket (number) of the commit.
     async fn apply_command(&mut self, command: Command) -> (Result<CommandOutcome, Answer>, Option<u64>) {
         self.drain().await;
         let time = self.clock.now();
@@ -196,8 +194,8 @@ impl ServiceLoop {
         (answer::outcome(monitor.alarms(), &command, &outputs.events, time), ticket)
     }
 
-    /// If the process was stopped, collects everything that has arrived on all interfaces since then, so that the core
-    /// receives these frames in order of time and before the present tick. Otherwise time would go backwards.
+    /// If the process was stopped, collects everything that has arrived on all interfaces since then. The core then
+    /// receives these frames in order of time and before the present tick, so that its time does not go backwards.
     async fn merge_after_stop(&mut self) {
         if self.clock.now().nanos() - self.ticked.nanos() <= MAX_PAUSE_NS {
             return;
@@ -205,7 +203,7 @@ impl ServiceLoop {
         let resumed = self.clock.now();
         self.ticked = resumed;
         for _ in 0..MERGE_ROUNDS {
-            // The tasks of the interfaces read their sockets here. Each of them has run before the pause ends.
+            // During this pause, each interface task reads its socket.
             tokio::time::sleep(MERGE_ROUND).await;
             let before = self.batch.len();
             while self.batch.len() < MAX_MERGED
@@ -219,10 +217,9 @@ impl ServiceLoop {
         }
     }
 
-    /// Handles everything that the interfaces have already received.
     async fn drain(&mut self) {
         for _ in 0..INBOX / BATCH {
-            // The tasks of the interfaces read from and write to their sockets here.
+            // Lets the interface tasks read from and write to their sockets.
             tokio::task::yield_now().await;
             self.merge_after_stop().await;
             while self.batch.len() < BATCH
@@ -248,7 +245,6 @@ impl ServiceLoop {
         self.batch.clear();
     }
 
-    /// Handles a step of a reload, and notifies the service manager.
     async fn handle_reload(&mut self, step: ReloadStep) {
         let read = match step {
             ReloadStep::Requested => return self.notify_reloading(),

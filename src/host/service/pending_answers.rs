@@ -35,12 +35,10 @@ impl PendingAnswers {
         self.waiting.push(PendingAnswer { ticket, until: now + MAX_WAIT, outcome, answer });
     }
 
-    /// Sends the answers whose commits have succeeded or failed.
     pub(super) fn note_progress(&mut self, progress: &StoreProgress) {
         self.send_if(Some(progress.works), |waiting| waiting.ticket <= progress.ticket);
     }
 
-    /// Sends the answers that have waited too long.
     pub(super) fn note_time(&mut self, now: Instant) {
         self.send_if(Some(false), |waiting| waiting.until <= now);
     }

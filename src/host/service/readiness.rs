@@ -19,23 +19,18 @@ pub const MAX_READY_TIMEOUT_S: f64 = 60.0;
 /// Default wait for the first reading (s). This wait is ten times the wake-up time of a bus, but too short to look like
 /// a start that hangs.
 pub const DEFAULT_READY_TIMEOUT_S: f64 = 10.0;
-/// Shortest time between two reports of the line.
 const STATUS_PERIOD: Duration = Duration::from_secs(1);
 /// Maximum number of lost signals that the line names. Further signals are counted.
 const MAX_NAMED: usize = 3;
-/// Longest line, bytes. A terminal can show this much. A datagram to the service manager could carry more.
+/// Longest line, bytes. A terminal can show a line of this length.
 const MAX_LINE: usize = 1500;
 
-/// A report to the service manager.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub(super) struct ManagerUpdate {
-    /// Whether the service has become ready.
     pub(super) ready: bool,
-    /// The new status line.
     pub(super) status: Option<String>,
 }
 
-/// Readiness and status line.
 #[derive(Debug)]
 pub(super) struct Readiness {
     interfaces: Vec<(String, LinkState)>,
@@ -48,9 +43,7 @@ pub(super) struct Readiness {
     inputs: usize,
     is_asleep: bool,
     store_works: bool,
-    /// Why the last reload was rejected.
     refused: Option<String>,
-    /// Description of the restored state.
     restored: Option<String>,
     reported: String,
     reported_at: Option<Instant>,
@@ -130,7 +123,6 @@ impl Readiness {
         self.new_line(now)
     }
 
-    /// Whether readiness was reported.
     pub(super) fn is_ready(&self) -> bool {
         self.is_ready
     }
@@ -171,7 +163,7 @@ impl Readiness {
         one_line(&line, MAX_LINE)
     }
 
-    /// The beginning of the line: whether there is input.
+    /// The beginning of the line, which states whether there is input.
     fn state(&self) -> String {
         let count = self.interfaces.len();
         let mut line = match self.first_after {
@@ -223,7 +215,6 @@ pub(super) fn describe_restored(age_s: Option<f64>) -> String {
     }
 }
 
-/// A duration in words.
 fn describe_duration(seconds: f64) -> String {
     match seconds {
         s if s < 120.0 => format!("{s:.0} s"),
@@ -233,7 +224,8 @@ fn describe_duration(seconds: f64) -> String {
     }
 }
 
-/// Replaces control characters (a line feed would start another assignment) and shortens the text to `limit` bytes.
+/// Replaces control characters and shortens the text to `limit` bytes. A line feed in the text would start another
+/// assignment in the message to the service manager.
 pub(super) fn one_line(text: &str, limit: usize) -> String {
     let line: String = text.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
     if line.len() <= limit {

@@ -1,11 +1,12 @@
 //! Reloads the configuration on SIGHUP, outside the service loop. If the new configuration is rejected, the old
 //! configuration stays in use.
 //!
-//! Only one reading runs at a time. Signals that arrive during a reading cause one further reading, which starts at
-//! least [`MIN_PERIOD`] after the start of the last reading. Many signals in a short time therefore neither fill the
-//! log nor block the loop. Because the last reading starts after the last signal, the newest file always applies in the
-//! end. A new configuration with other interfaces or another store is rejected, because these changes require a
-//! restart. The core decides whether all other changes can be applied
+//! Only one read of the files runs at a time. Signals that arrive during a read cause one further read, which starts at
+//! least [`MIN_PERIOD`] after the start of the last one. Many signals in a short time therefore neither fill the log
+//! nor block the loop. The last read starts after the last signal, so the newest file always applies in the end.
+//!
+//! A new configuration with other interfaces or another store is rejected, because these changes require a restart. The
+//! core decides whether all other changes can be applied
 //! ([`Monitor::reconfigure`](crate::monitor::Monitor::reconfigure)).
 
 use std::fmt;
@@ -22,30 +23,25 @@ use crate::config::{self, Config, InterfaceConfig, KeySource, StoreConfig, Vehic
 use crate::monitor::{MonitorConfig, Reconfigured};
 use crate::status::document::ConfigFile;
 
-/// Shortest time between the starts of two readings.
 const MIN_PERIOD: Duration = Duration::from_secs(1);
 /// Maximum number of faults that are logged one by one. A file that is not a configuration may have thousands of
 /// faults.
 const MAX_FAULTS_LOGGED: usize = 50;
 
-/// A step of a reload.
 #[derive(Debug)]
 pub(super) enum ReloadStep {
     /// A signal arrived; [`ReloadStep::Read`] follows.
     Requested,
-    /// The file was read: the new configuration, or every fault.
+    /// The file was read. Contains the new configuration, or every fault.
     Read(Result<Box<LoadedConfig>, Vec<String>>),
 }
 
-/// A configuration that was read.
 #[derive(Debug)]
 pub(super) struct LoadedConfig {
     pub(super) monitor: MonitorConfig,
-    /// The file, for the status document.
     pub(super) file: Option<ConfigFile>,
 }
 
-/// The reading task.
 type LoadTask = JoinHandle<Result<Box<LoadedConfig>, Vec<String>>>;
 
 /// Catches SIGHUP and reads the configuration.
@@ -55,9 +51,8 @@ pub(super) struct Reload {
     path: PathBuf,
     fixed: Arc<FixedSettings>,
     reading: Option<LoadTask>,
-    /// Whether a signal still waits for its reading.
+    /// Whether a signal has arrived after the start of the last read.
     is_requested: bool,
-    /// Earliest start of the next reading.
     not_before: Instant,
 }
 
@@ -95,7 +90,6 @@ impl Reload {
         }
     }
 
-    /// Whether a reload is running or waiting.
     pub(super) fn is_busy(&self) -> bool {
         self.is_requested || self.reading.is_some()
     }

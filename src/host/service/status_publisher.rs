@@ -11,7 +11,6 @@ use crate::status::collect::{CounterBaseline, ServiceIdentity, Sources};
 use crate::status::counters::{Latency, ServiceCounters};
 use crate::status::document::ConfigFile;
 
-/// Publishes the daemon's status once a second, and counts the work of the loop.
 #[derive(Debug)]
 pub(super) struct StatusPublisher {
     server: Option<StatusServer>,
@@ -19,8 +18,8 @@ pub(super) struct StatusPublisher {
     counters: ServiceCounters,
     latency: Latency,
     published: Option<Instant>,
-    /// Counts of earlier runs. The counts are taken with the first document, when the first tick has restored the
-    /// stored state and no frame has been counted yet.
+    /// Counts of earlier runs. They are taken with the first document. At that time, the first tick has restored the
+    /// stored state, and no frame has been counted yet.
     before: Option<CounterBaseline>,
 }
 
@@ -52,8 +51,8 @@ impl StatusPublisher {
         }
     }
 
-    /// Publishes a document, unless the last one was published less than one [`PERIOD`] ago. `tick`: the time at which
-    /// the current tick was due.
+    /// Publishes a document, unless the last one was published less than one [`PERIOD`] ago. `tick` is the time at
+    /// which the current tick was due.
     pub(super) fn publish(&mut self, engine: &Engine, tick: Instant, now: Timestamp) {
         let Some(server) = &self.server else { return };
         if self.published.is_some_and(|published| tick.duration_since(published) < PERIOD) {

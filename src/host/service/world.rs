@@ -1,12 +1,13 @@
-//! Simulated lives of the daemon: the engine with its monitor, sender, commands, authentication, polling and the real
-//! store on a file system in memory, in simulated time. One seed is one life.
+//! Simulates the daemon with random faults. The engine, its monitor and the real store run in simulated time, with
+//! commands, authentication and polling. The store is in a temporary folder, in memory if possible.
 //!
-//! Faults: lost, repeated and foreign frames, silence, bus events, clock steps, stops of hours, clean ends, kills at any
-//! step, commits that a kill cut off, flipped bytes in the stored files, files deleted or replaced under the process.
-//! After each step, the invariants of [`World::check`] must hold. A broken invariant prints the seed and the step;
-//! `PACKWATCH_SEED` repeats that life.
+//! A simulated run is called a life. Its seed determines the whole life. Faults are lost, repeated and foreign frames,
+//! silence, bus events, clock steps, stops of hours, clean ends, and kills at any step, even before a commit reaches
+//! the disk. Bytes in the stored files are flipped, and files are deleted or replaced while the process runs. Every
+//! step checks the estimates, the sent frames and the store. A failure prints the seed and the step; `PACKWATCH_SEED`
+//! repeats the life.
 //!
-//! Deviation: the disk is a real file system, so writes are neither reordered nor torn; `tests/vcan` cuts the power of a
+//! The folder is in a real file system, so writes are neither reordered nor torn. `tests/vcan` cuts the power of a
 //! simulated disk.
 
 mod nodes;
@@ -27,26 +28,23 @@ use crate::quantity::{CellIndex, Channel, SensorIndex, Timestamp};
 /// Time of a step. A real daemon has a tick every 10 ms.
 const STEP_NS: i64 = 100_000_000;
 const BUS: BusIndex = BusIndex(0);
-/// Identifiers that the daemon may send: its frames, and the request.
+/// Identifiers that the daemon may send: its own frames and the diagnostic request.
 const ALLOWED: [u16; 7] = [0x6B0, 0x6B1, 0x6B2, 0x6B4, 0x6B5, 0x6B6, 0x79B];
 const ALARM: u16 = 0x6B2;
-/// Cyclic frames.
 const CYCLIC: [u16; 4] = [0x6B0, 0x6B1, 0x6B4, 0x6B6];
 
-/// Counts of a life.
 #[derive(Debug, Default)]
 struct Counts {
     steps: u64,
     faults: u64,
     starts: u64,
     commands: u64,
-    /// Recorded commands that were sent again.
+    /// Number of times that a recorded command was sent again.
     replays: u64,
     frames: u64,
     commits: u64,
 }
 
-/// The daemon, its disk, its bus and the other nodes.
 struct World {
     dice: Dice,
     place: tempfile::TempDir,
@@ -58,23 +56,23 @@ struct World {
     unchecked: VecDeque<Frame>,
     encoder: InputEncoder,
     sender: Sender,
-    /// Commands that must not be executed: executed before, or held back across a start.
+    /// Commands that the daemon must reject. They were executed before, or were held back across a start.
     recorded: VecDeque<Frame>,
-    /// Commands of this run that an attacker holds back.
+    /// Commands since the last start that an attacker holds back.
     withheld: Vec<Frame>,
     /// Steps until the recorded commands are sent.
     replay_in: u32,
     /// Highest freshness of all sent frames.
     freshness: u64,
-    /// Rows of the history that were confirmed.
+    /// Number of history rows that the store has confirmed.
     rows: i64,
-    /// Times of the alarm frames and the requests of the last second, ns.
+    /// Times of the alarm frames and of the requests in the last second, ns.
     alarms: VecDeque<i64>,
     requests: VecDeque<i64>,
     standby: bool,
     /// Whether the files were changed from outside since the start.
     tampered: bool,
-    /// Steps since the last start, frame, stop or step of the clock.
+    /// Steps since the last frame, start, stop or clock step.
     silent_steps: u32,
     silent_until: i64,
     soc: f64,
@@ -99,7 +97,7 @@ impl World {
             recorded: VecDeque::new(),
             withheld: Vec::new(),
             replay_in: 0,
-            // The freshness of a first start follows from the clock.
+            // On the first start, the freshness is computed from the clock.
             freshness: 1_800_000_000 * 256 - 1,
             rows: 0,
             alarms: VecDeque::new(),
@@ -125,7 +123,6 @@ impl World {
         self.place.path().join(self.generation.to_string())
     }
 
-    /// Starts the daemon on the present folder.
     fn start(&mut self) {
         let mut service = Service {
             config: loaded(),
@@ -146,7 +143,7 @@ impl World {
             key: Some(key()),
         };
         let mut engine = Engine::new(&mut service, MappedClock::new(Reading::now())).unwrap();
-        // The first input sets the monitor's clock; the start is stored before the first frame.
+        // The first input sets the monitor's clock. The start is stored before the first frame.
         let tick = Record::tick(self.now());
         engine.handle(&tick);
         engine.store_start(self.now());
@@ -157,7 +154,7 @@ impl World {
             assert!(progress.rows >= self.rows, "{} rows were confirmed, {} are there", self.rows, progress.rows);
             assert!(progress.works, "the store works");
         }
-        // A damaged state may have lost the command.
+        // If the stored state was damaged, the standby command may be lost.
         self.standby &= !self.tampered;
         (self.rows, self.tampered) = (progress.rows, false);
         (self.engine, self.next_frame) = (Some(engine), Box::new(next_frame));
@@ -167,7 +164,7 @@ impl World {
         self.counts.starts += 1;
     }
 
-    /// Copies the folder as a kill leaves it, and continues with the copy.
+    /// Kills the process: copies the folder in its present state, and continues with the copy.
     fn kill(&mut self) {
         let before = self.state();
         self.generation += 1;
@@ -175,7 +172,7 @@ impl World {
         self.discard(&before);
     }
 
-    /// Ends the process. What it still writes goes to a folder that nobody reads.
+    /// Ends the process. Its last writes go to the old folder, which is then deleted.
     fn discard(&mut self, folder: &Path) {
         let now = self.now();
         if let Some(mut engine) = self.engine.take() {
@@ -184,7 +181,8 @@ impl World {
         fs::remove_dir_all(folder).unwrap();
     }
 
-    /// Passes a record to the daemon, and handles what it sends. `is_cut` kills the process before the commit.
+    /// Passes a record to the daemon and checks the frames that it sends. If `is_cut` is true, the process is killed
+    /// before the commit.
     fn give(&mut self, record: &Record, is_cut: bool) {
         let kept = is_cut.then(|| {
             let kept = self.place.path().join("kept");
@@ -195,12 +193,13 @@ impl World {
         let Some(engine) = &mut self.engine else { return };
         let was_asleep = engine.monitor.asleep_since().is_some();
         let ticket = engine.handle(record);
-        // After a start, a frame, a stop or a step of the clock, the program must first observe the silence itself.
+        // The daemon counts as asleep only after it has observed the silence itself. The silence begins with the last
+        // frame, start, stop or clock step.
         if matches!(record.kind, RecordKind::Frame { .. }) {
             self.silent_steps = 0;
         }
         let asleep = self.silent_steps > 100 && was_asleep && engine.monitor.asleep_since().is_some();
-        // What a commit must precede is not sent before the commit.
+        // A frame that announces a result must not be sent before the result is committed.
         let is_held = |sent: &&crate::monitor::Transmit| sent.announces && sent.secured.is_none();
         let held: Vec<Frame> = engine.outputs.frames.iter().filter(is_held).map(|sent| sent.frame).collect();
         self.unchecked.extend(std::iter::from_fn(&mut self.next_frame));
@@ -218,7 +217,8 @@ impl World {
         }
         if let Some(kept) = kept {
             if ticket.is_some() {
-                // The commit did not reach the disk, and what it announces was not sent.
+                // The process was killed before the commit reached the disk. Frames that wait for the commit were not
+                // sent.
                 self.check_sent(now_ns, asleep, was_standby);
                 self.discard(&self.state());
                 self.generation += 1;
@@ -255,7 +255,6 @@ impl World {
         self.counts.commits = self.counts.commits.max(progress.commits);
     }
 
-    /// The invariants of the sent frames.
     fn check_sent(&mut self, now_ns: i64, is_asleep: bool, is_standby: bool) {
         while let Some(frame) = self.unchecked.pop_front().or_else(&mut self.next_frame) {
             self.counts.frames += 1;
@@ -288,7 +287,8 @@ impl World {
     fn freshness_of(&mut self, id: u16, frame: &Frame) -> Option<u64> {
         match id {
             0x6B6 => {
-                // An announcement contains the freshness of the next command, which may repeat.
+                // An announcement contains the freshness of the next command. Two announcements may contain the same
+                // value.
                 self.sender.hear(frame);
                 None
             }
@@ -307,7 +307,6 @@ impl World {
         }
     }
 
-    /// The invariants of the estimates.
     fn check(&self) {
         let Some(engine) = &self.engine else { return };
         for estimate in engine.monitor.latest().flatten() {
@@ -340,7 +339,7 @@ impl World {
         }
     }
 
-    /// Frames of the vehicle.
+    /// Sends the frames of the vehicle. A frame may be lost or repeated.
     fn drive(&mut self) {
         if self.dice.one_in(200) {
             self.current_a = [0.0, 0.0, 2.6, -2.6, 5.0, -1.0][self.dice.below(6) as usize];
@@ -370,7 +369,7 @@ impl World {
         }
     }
 
-    /// A fault, a command or another rare event.
+    /// Injects a fault, a command or another rare event.
     fn fault(&mut self) {
         self.counts.faults += 1;
         let time = self.now();
@@ -432,7 +431,7 @@ impl World {
         }
     }
 
-    /// Sends the newest commands that must not be executed.
+    /// Sends the newest commands that the daemon must reject.
     fn send_recorded(&mut self) {
         for frame in self.recorded.clone().iter().rev().take(20) {
             self.counts.replays += 1;
@@ -440,7 +439,7 @@ impl World {
         }
     }
 
-    /// First frames of multi-frame answers without end, and answers that nobody requested.
+    /// Sends first frames of multi-frame answers that are never completed, and answers without a request.
     fn flood(&mut self) {
         for n in 0..300_u16 {
             let data =
@@ -451,7 +450,6 @@ impl World {
         }
     }
 
-    /// Flips a byte of a stored file.
     fn flip(&mut self) {
         self.tampered = true;
         let mut files: Vec<_> = fs::read_dir(self.state()).unwrap().map(|entry| entry.unwrap().path()).collect();
@@ -465,8 +463,8 @@ impl World {
         }
     }
 
-    /// Deletes or replaces the database under the process. The store must not report success for the file without a
-    /// name.
+    /// Deletes or replaces the database while the process runs. The store must not report success for a file that no
+    /// longer has this name.
     fn lose_file(&mut self) {
         self.tampered = true;
         let database = self.state().join("packwatch.db");
@@ -490,7 +488,7 @@ fn copy(from: &Path, to: &Path) {
     fs::create_dir_all(to).unwrap();
     for entry in fs::read_dir(from).unwrap() {
         let path = entry.unwrap().path();
-        // The process may delete a file of its own meanwhile.
+        // The process may delete one of its files during the copy.
         let _ = fs::copy(&path, to.join(path.file_name().unwrap()));
     }
 }
@@ -520,8 +518,8 @@ impl std::ops::AddAssign for Counts {
     }
 }
 
-/// Runs lives for `PACKWATCH_SIMULATE_S` seconds (default 20) on `PACKWATCH_SIMULATE_JOBS` threads (default 1), from the
-/// seed `PACKWATCH_SEED` (default 1) on.
+/// Runs lives with consecutive seeds. Environment: `PACKWATCH_SIMULATE_S` is the duration in seconds (default 20),
+/// `PACKWATCH_SIMULATE_JOBS` the number of threads (default 1), `PACKWATCH_SEED` the first seed (default 1).
 #[test]
 fn simulated_lives_keep_invariants() {
     let number = |name: &str, default: u64| std::env::var(name).map_or(default, |text| text.parse().expect("a number"));

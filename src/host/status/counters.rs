@@ -1,8 +1,7 @@
-//! Counts the work of the service loop, the status clients and the latency of frames. The counters are plain numbers
-//! that the loop owns.
+//! Counts the work of the service loop, the status clients and the latency of frames.
 //!
-//! In: the lateness of ticks and the latency of frames (s). Out: structs of the status document. Nothing is allocated
-//! or locked per frame.
+//! In: the lateness of ticks and the latency of frames (s). Out: structs of the status document. The counters are plain
+//! numbers that the loop owns, so nothing is allocated or locked per frame.
 
 use serde::{Deserialize, Serialize};
 
@@ -50,8 +49,8 @@ impl Latency {
         self.sum_s += seconds;
     }
 
-    /// Returns a latency (s) that at least the fraction `share` of all frames did not exceed: the lowest bucket bound
-    /// with this property. `None` = no frame was counted, or too many frames are in the last, unbounded bucket.
+    /// Returns the lowest bucket bound (s) that at least the fraction `share` of all frames did not exceed. `None` = no
+    /// frame was counted, or too many frames are in the last, unbounded bucket.
     pub fn quantile_s(&self, share: f64) -> Option<f64> {
         let wanted = (share * self.frames as f64).ceil().max(1.0);
         let mut so_far = 0;

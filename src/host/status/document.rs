@@ -95,8 +95,8 @@ pub struct StatusDocument {
     /// number minus one. 0 in documents of older versions.
     #[serde(default)]
     pub event_count: u64,
-    /// The latest events, oldest first, in the format of `--events`; without events that occur once per cell and
-    /// half-cycle. The list has 32 events, or more if more occurred in the last 5 s (at most 1,024).
+    /// The latest events, oldest first, in the format of `--events`. Events that occur once per cell and half-cycle are
+    /// left out. The list has 32 events, or more if more occurred in the last 5 s (at most 1,024).
     pub events: Vec<serde_json::Value>,
 }
 
@@ -184,9 +184,9 @@ impl AlarmStatus {
     }
 }
 
-/// Counters. All counters start at 0 when the program starts, including the counters of interfaces, protected messages,
-/// controllers and floods. The only exception is `lifetime`. The reason: after a power cut, a stored count may be a
-/// minute old, but readers that sum differences need counters that never decrease.
+/// Counters. Except for `lifetime`, all counters start at 0 when the program starts, including the counters of
+/// interfaces, protected messages, controllers and floods. They do not continue from stored counts, because a stored
+/// count may be a minute old after a power cut. Readers that sum differences need counters that never decrease.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct StatusCounters {
     /// Counters of the core.
@@ -320,8 +320,8 @@ pub enum IntruderKind {
 pub struct Intruder {
     /// Interface.
     pub interface: String,
-    /// Identifier that the sender uses. If the sender uses several identifiers of this program on an interface: the
-    /// latest one.
+    /// Identifier that the sender uses. If the sender uses several identifiers of this program on an interface, this is
+    /// the latest one.
     pub id: String,
     /// What the sender does.
     pub kind: IntruderKind,

@@ -23,7 +23,7 @@ const STATES: [(&str, &str, &str, &str); 9] = [
     ("test", "running", "alarm test started", "alarm test ended"),
     ("trust", "trusted", "estimate trusted again", "estimate untrusted"),
 ];
-/// Keys shown for an alarm. The text before the colon is its rule and its change.
+/// Keys that are shown for an alarm after its rule and its change.
 const OF_ALARM: [&str; 4] = ["cell", "severity", "threshold", "value"];
 /// Keys whose numbers are hexadecimal.
 const HEXADECIMAL: [&str; 6] = ["against", "class", "code", "identifier", "service", "to"];
@@ -105,7 +105,7 @@ fn part(event: &Map<String, Value>, key: &str, value: &Value, document: &StatusD
         return Some(format!("{name} {}", rule.map_or_else(|| number(value), |rule| rule.with_unit(value))));
     }
     Some(match value {
-        // Without these values, the event is complete: without a cell, it is about the whole pack.
+        // These keys may be missing from a complete event. An event without a cell is about the whole pack.
         Value::Null if ["cell", "chemistry", "seconds"].contains(&key) => return None,
         Value::Null => format!("{name} unknown"),
         Value::Bool(is_so) => {

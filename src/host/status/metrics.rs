@@ -69,11 +69,9 @@ pub fn prometheus_text(openmetrics: &str) -> String {
     text
 }
 
-/// A collector that writes the metrics of a document.
 #[derive(Debug)]
 struct Metrics(Option<StatusDocument>);
 
-/// Labels of a sample.
 type Labels = Vec<(&'static str, String)>;
 
 /// Writes metric families. Samples with unknown values are omitted.
@@ -126,7 +124,6 @@ impl Families<'_> {
     }
 }
 
-/// A sample without labels.
 fn one<T>(value: T) -> [(Labels, T); 1] {
     [(Labels::new(), value)]
 }

@@ -27,7 +27,6 @@ use crate::monitor::Event;
 /// Pause after a connection could not be accepted. The usual reason is that no descriptor is left. An immediate retry
 /// would then fail too.
 const ACCEPT_PAUSE: Duration = Duration::from_secs(1);
-/// Shortest time between two log lines about rejected clients.
 const REFUSAL_LOG_PERIOD: Duration = Duration::from_secs(60);
 /// Stack of the thread, bytes. A small stack is enough, because the thread only serialises and waits.
 const STACK_BYTES: usize = 512 << 10;
@@ -52,7 +51,6 @@ impl Draft {
     }
 }
 
-/// A serialised document and its time.
 #[derive(Debug, Clone)]
 struct PublishedLine {
     line: Arc<[u8]>,
@@ -129,7 +127,6 @@ struct Limits {
     stale: Duration,
 }
 
-/// State shared by all clients.
 #[derive(Debug, Clone)]
 struct ClientContext {
     counters: Arc<Mutex<ClientCounts>>,
@@ -219,7 +216,6 @@ impl RefusalLog {
     }
 }
 
-/// The connected clients.
 struct Clients {
     tasks: JoinSet<()>,
     slots: ConnectionSlots<LocalProcess>,
@@ -227,7 +223,6 @@ struct Clients {
 }
 
 impl Clients {
-    /// Serves a client if there is room.
     async fn admit<S: Future<Output = ()> + Send + 'static>(
         &mut self,
         accepted: io::Result<(UnixStream, SocketAddr)>,
@@ -255,7 +250,6 @@ impl Clients {
     }
 }
 
-/// Sends one fresh document.
 async fn serve_once(mut client: UnixStream, context: ClientContext, mut latest: Latest) {
     let fresh =
         latest.wait_for(|published| published.as_ref().is_some_and(|it| it.at.elapsed() < context.limits.stale));

@@ -21,8 +21,9 @@ pub const SILENCE: Duration = Duration::from_secs(5);
 /// Pause before reconnecting.
 pub const RETRY: Duration = Duration::from_secs(1);
 
-/// Passes each line of the stream next to the status socket `socket` to `handle`, and an error message after each
-/// failure. `setting` is the option or the key that names the socket. Logs when the daemon starts or stops reporting.
+/// Passes each line of the stream that belongs to the status socket `socket` to `handle`, and an error message after
+/// each failure. `setting` is the option or the key that names the socket. Logs when the daemon starts or stops
+/// reporting.
 pub async fn follow(socket: &Path, setting: &str, mut handle: impl FnMut(Result<&[u8], &str>) -> Result<(), String>) {
     let mut was_up = None;
     loop {
@@ -35,13 +36,12 @@ pub async fn follow(socket: &Path, setting: &str, mut handle: impl FnMut(Result<
             tracing::warn!(error, "no status from the daemon");
         }
         was_up = Some(false);
-        // The handler can only reject a line.
+        // The handler's result matters only for a line, which the handler may reject.
         let _ = handle(Err(&error));
         sleep(RETRY).await;
     }
 }
 
-/// Reads one connection until it ends.
 async fn read(
     path: &Path,
     handle: &mut impl FnMut(Result<&[u8], &str>) -> Result<(), String>,

@@ -9,21 +9,19 @@ use std::collections::VecDeque;
 use super::rows::{HistoryRow, RowBatch};
 use super::stamp::Stamp;
 
-/// Maximum number of rows that wait for the disk. This many rows take half a megabyte of memory. For a pack of 96
-/// cells, they cover about 25 half-cycles of each cell, that is (days) of driving.
+/// Maximum number of rows that wait for the disk. They take half a megabyte of memory. For a pack of 96 cells, they
+/// cover about 25 half-cycles of each cell, that is, days of driving.
 pub(super) const MAX_ROWS: usize = 5_000;
 
-/// Waiting rows, oldest first.
 #[derive(Debug, Default)]
 pub(super) struct Backlog {
     batches: VecDeque<RowBatch>,
     rows: usize,
     lost: LossCount,
-    /// Numbers of dropped rows that were reported with the last `take`. `commit` subtracts these numbers from `lost`.
+    /// Numbers of dropped rows that the last `take` reported. `commit` subtracts them from `lost`.
     reported: LossCount,
 }
 
-/// Numbers of dropped rows.
 #[derive(Debug, Clone, Copy, Default)]
 struct LossCount {
     details: u64,
@@ -31,7 +29,6 @@ struct LossCount {
 }
 
 impl Backlog {
-    /// Appends rows.
     pub(super) fn push(&mut self, batch: RowBatch) {
         self.rows += batch.rows.len();
         self.batches.push_back(batch);

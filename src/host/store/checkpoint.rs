@@ -10,33 +10,31 @@ use crate::quantity::Timestamp;
 /// Bytes that may be written per day before checkpoints are delayed. In total, 20 MB may be written per day; the rest
 /// is left for bursts of alarms.
 const BYTES_PER_DAY: f64 = 15e6;
-/// Bytes that a commit without a state writes. SQLite writes three of its pages, first to its log and later to its
-/// file. Each write is rounded up to whole pages of the system.
+/// Bytes that a commit without a state writes. SQLite writes three pages, first to its log and later to its file.
+/// Each write is rounded up to whole pages of the system.
 const COMMIT_BYTES: f64 = 8e3;
 /// Bytes that each row adds to a commit, in the log and later in the file of SQLite.
 const ROW_BYTES: f64 = 180.0;
-/// Longest time without a checkpoint (s), regardless of what else was written.
+/// Maximum time without a checkpoint (s), regardless of what else was written.
 const MAX_PERIOD_S: f64 = 3600.0;
 
-/// The schedule of checkpoints.
 #[derive(Debug)]
 pub(super) struct CheckpointSchedule {
-    /// Shortest period (s).
+    /// Minimum period (s).
     period_s: f64,
     /// Time when the state was last written.
     last: Option<Timestamp>,
-    /// Bytes written beyond the daily rate, and the time to which this number refers.
+    /// Bytes written beyond the daily rate, and the time at which this number was computed.
     ahead: (f64, Timestamp),
 }
 
 impl CheckpointSchedule {
-    /// A schedule with the shortest period `period_s` (s).
     pub(super) fn new(period_s: f64) -> Self {
         Self { period_s, last: None, ahead: (0.0, Timestamp::ZERO) }
     }
 
-    /// Whether a checkpoint is due. Between two states, at least `period_s` and the shortest period of the schedule
-    /// must pass. The same time must pass between the first call and the first checkpoint.
+    /// Whether a checkpoint is due. Since the last state, at least `period_s` and the minimum period of the schedule
+    /// must have passed. For the first checkpoint, the time counts from the first call.
     pub(super) fn is_due(&mut self, now: Timestamp, period_s: f64) -> bool {
         let elapsed_s = now.since(*self.last.get_or_insert(now));
         let may_write = self.ahead_at(now) <= 0.0 || elapsed_s >= MAX_PERIOD_S;

@@ -1,10 +1,9 @@
 //! Holds frames until the results that they announce are on disk.
 //!
-//! During a commit, every announcing frame ([`Transmit::announces`]) waits: the frames that announce the result, the
-//! cyclic frames that would repeat the result, and all other frames of the same kinds. If the first packet of a
-//! transfer waits, its later packets wait too. The frames are sent in order. The status frame is not held, because its
-//! state of charge and validity must be up to date. All that the status frame states about alarms is the number of
-//! raised alarms.
+//! During a commit, every announcing frame ([`Transmit::announces`]) waits. These are the frames that announce the
+//! result, the cyclic frames that would repeat it, and all other frames of the same kinds. If the first packet of a
+//! transfer waits, its later packets wait too. The frames are sent in order. The status frame is not held, because
+//! its state of charge and validity must be up to date. Of the alarms, it states only the number of raised alarms.
 //!
 //! No frame waits longer than [`MAX_WAIT`], because an alarm on the bus is more important than an alarm on disk.
 
@@ -15,10 +14,10 @@ use tokio::time::Instant;
 
 use crate::monitor::Transmit;
 
-/// Longest wait of a frame for the disk.
+/// Maximum wait of a frame for the disk.
 const MAX_WAIT: Duration = Duration::from_millis(200);
 /// Maximum number of held frames. If more frames are held, all of them are released. The largest pack, with an alarm
-/// for each cell, sends this many frames in twice the time [`MAX_WAIT`].
+/// for each cell, sends this many frames in twice [`MAX_WAIT`].
 const MAX_HELD: usize = 4096;
 
 /// Holds announcing frames while commits are running.

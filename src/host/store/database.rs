@@ -8,6 +8,7 @@
 //! | `capacity` | a learned capacity | as long as its segment |
 //! | `loss_modes` | the loss modes of a cell | as long as its segment |
 //! | `remaining_life` | a forecast of the remaining life | as long as its segment |
+//! | `outlook` | energy and power of the pack | as long as its segment |
 //! | `model` | a change of the cell model | as long as its segment |
 //! | `alarm` | a change of an alarm | as long as its segment |
 //! | `reset` | a reset, a pack change, or a damaged file | as long as its segment |
@@ -17,9 +18,9 @@
 //! The tables from `half_cycle` to `reset` share one numbering of rows. The oldest segments are deleted first; their
 //! rows in `segment` remain. Cells count from 0, times are nanoseconds. `PRAGMA user_version` is the format.
 //!
-//! * The database is one file in write-ahead mode with `synchronous=FULL`. A commit that has returned survives a power
-//!   cut, and a commit that has not returned leaves no trace.
-//! * A damaged file and an inaccessible file give different errors. A file with another format counts as damaged.
+//! The database is one file in write-ahead mode with `synchronous=FULL`. A commit that has returned survives a power
+//! cut, and a commit that has not returned leaves no trace. A damaged file and an inaccessible file give different
+//! errors. A file with another format counts as damaged.
 
 use std::fs::{File, Metadata};
 use std::os::unix::fs::MetadataExt as _;
@@ -43,11 +44,10 @@ use crate::quantity::Timestamp;
 
 /// The format that this program reads and writes.
 pub(super) const FORMAT: i32 = 3;
-/// Longest wait of a commit for a reader that has locked the database.
+/// Maximum time that a commit waits for a reader that has locked the database.
 const BUSY_TIMEOUT: Duration = Duration::from_millis(100);
-/// Longest check of the file at the start. Damage in the part that was not checked is found when that part is read.
+/// Maximum duration of the check at the start. Damage in the unchecked part is found when that part is read.
 const MAX_CHECK: Duration = Duration::from_secs(2);
-/// The tables that are not in [`HistoryTable`].
 const TABLES: &str = "
 CREATE TABLE meta (id INTEGER PRIMARY KEY CHECK (id = 1), segments INTEGER NOT NULL, vehicle TEXT) STRICT;
 INSERT INTO meta VALUES (1, 0, NULL);
@@ -122,13 +122,10 @@ pub(super) fn is_damage(error: &rusqlite::Error) -> bool {
     }
 }
 
-/// The database, open for writing.
 #[derive(Debug)]
 pub(super) struct Database {
     connection: Connection,
-    /// The newest segment.
     segment: Segment,
-    /// Number of the connected pack.
     pack: i64,
     path: PathBuf,
     /// Device and inode of the database and of its log when they were opened; `None` = no such file.
@@ -138,9 +135,8 @@ pub(super) struct Database {
 /// Limits of the history. If one is exceeded, the oldest segments are deleted.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct RowLimits {
-    /// Maximum number of rows kept.
     max_rows: i64,
-    /// Longest age, years; `None` = unlimited.
+    /// Maximum age, years; `None` = unlimited.
     keep_years: Option<f64>,
 }
 
@@ -191,17 +187,15 @@ impl Database {
         files_at(&self.path) == self.opened
     }
 
-    /// Number of rows ever written.
     pub(super) fn rows(&self) -> i64 {
         self.segment.last
     }
 
-    /// Number of the connected pack.
     pub(super) fn pack(&self) -> i64 {
         self.pack
     }
 
-    /// The chain's end: number of rows and hash of the last row.
+    /// End of the hash chain: number of rows and hash of the last row.
     pub(super) fn head(&self) -> (i64, String) {
         (self.segment.last, hex(&self.segment.hash))
     }
@@ -248,7 +242,6 @@ impl Database {
         learned::alarm_changes(&self.connection, self.pack, after)
     }
 
-    /// Returns the learned values of the connected pack's cells.
     pub(super) fn learned(&self) -> rusqlite::Result<Vec<LearnedCell>> {
         learned::read(&self.connection, self.pack)
     }
@@ -271,24 +264,20 @@ impl Database {
         Ok(self.pack)
     }
 
-    /// Returns the connection, for tests.
     #[cfg(test)]
     pub(super) fn connection(&self) -> &Connection {
         &self.connection
     }
 }
 
-/// Device and inode of a file.
 pub(super) fn file_id(file: &Metadata) -> (u64, u64) {
     (file.dev(), file.ino())
 }
 
-/// Returns device and inode of the database at `path` and of its log.
 fn files_at(path: &Path) -> [Option<(u64, u64)>; 2] {
     [path.to_owned(), with_suffix(path, "-wal")].map(|path| std::fs::metadata(path).ok().as_ref().map(file_id))
 }
 
-/// Returns the format of an open database.
 pub(super) fn format(connection: &Connection) -> rusqlite::Result<i32> {
     connection.query_row("PRAGMA user_version", [], |row| row.get(0))
 }
@@ -299,7 +288,6 @@ pub(super) fn vehicle(connection: &Connection) -> rusqlite::Result<VehicleIdenti
     Ok(text.and_then(|text| serde_json::from_str(&text).ok()).unwrap_or_default())
 }
 
-/// Creates all tables or none.
 fn create(connection: &mut Connection) -> rusqlite::Result<()> {
     let transaction = connection.transaction_with_behavior(TransactionBehavior::Immediate)?;
     transaction.execute_batch(TABLES)?;
@@ -339,7 +327,6 @@ fn prepare(connection: &Connection) -> rusqlite::Result<()> {
     connection.query_row("PRAGMA wal_autocheckpoint = 512", [], |_| Ok(()))
 }
 
-/// Checks the file for at most [`MAX_CHECK`].
 fn check(connection: &mut Connection) -> Result<(), OpenError> {
     let started = Instant::now();
     // The handler runs every 10,000 steps of SQLite's virtual machine.
@@ -357,7 +344,6 @@ fn check(connection: &mut Connection) -> Result<(), OpenError> {
     }
 }
 
-/// Writes the rows of one moment, and applies the pack changes among them to `pack`.
 fn write_batch(
     transaction: &Transaction<'_>,
     segment: &mut Segment,

@@ -13,7 +13,6 @@ use super::stamp::Stamp;
 use super::state_files;
 use crate::io::place::with_suffix;
 
-/// Name of the database.
 pub(super) const DATABASE: &str = "packwatch.db";
 /// Name of the file that a daemon keeps locked.
 const LOCK: &str = "packwatch.lock";
@@ -24,7 +23,6 @@ const FILES: [&str; 3] = ["-wal", "-shm", ""];
 /// with damaged databases.
 const MAX_SET_ASIDE: u32 = 8;
 
-/// The state folder.
 #[derive(Debug)]
 pub(super) struct Folder {
     path: PathBuf,
@@ -46,7 +44,6 @@ impl Folder {
         Self { path, lock: None, damage: None }
     }
 
-    /// Path of the folder.
     pub(super) fn path(&self) -> &Path {
         &self.path
     }
@@ -59,7 +56,7 @@ impl Folder {
     }
 
     /// Creates the folder if it does not exist, and locks it for this process. If the lock file has been deleted or
-    /// replaced, the old lock is worthless: another daemon can lock the new file.
+    /// replaced, locks the new file, because another daemon could lock it.
     ///
     /// # Errors
     /// Returns `WouldBlock` if another process has locked the folder, else the reason why the folder cannot be written.
@@ -111,7 +108,6 @@ impl Folder {
         self.damage = Some(why.to_owned());
     }
 
-    /// Renames the database and SQLite's other files.
     fn set_aside(&self, place: &Path) -> io::Result<()> {
         let path = self.path.join(DATABASE);
         for suffix in FILES {
@@ -128,7 +124,6 @@ impl Folder {
         File::open(&self.path)?.sync_all()
     }
 
-    /// The name for the next damaged database.
     fn free_place(&self) -> PathBuf {
         let place = |number: u32| self.path.join(format!("{DATABASE}.damaged-{number}"));
         let free = (1..MAX_SET_ASIDE).map(place).find(|place| !place.exists());

@@ -1,7 +1,7 @@
 //! Selects the events that the history keeps, and decides when they are committed.
 //!
 //! In: the events of one input. Out: rows to commit now, if any, and whether to write the state with them. Token
-//! buckets limit the rows that differ little from earlier rows; these buckets use the times of the events. Rows of
+//! buckets limit the rows that differ little from earlier rows. The buckets use the times of the events. Rows of
 //! alarm changes are limited only by the debounce of the alarm rules.
 
 use std::collections::BTreeMap;
@@ -14,19 +14,18 @@ use crate::quantity::catalogue::Quantity;
 use crate::quantity::{CellIndex, Timestamp};
 use crate::token_bucket::{BucketSize, TokenBucket};
 
-/// Number of measured capacities of one cell that are written even if they have not changed: 64 at once (two days of an
-/// electric car), then one per hour. Further capacities are written only if they have changed, because each row takes
-/// 100 bytes and is kept for years. Without this limit, a hybrid that changes between charge and discharge every minute
+/// Number of measured capacities of one cell that are written even if they have not changed: 64 at once (two days of
+/// an electric car), then one per hour. Further capacities are written only if they have changed, because each row
+/// takes 100 bytes and is kept for years. Otherwise, a hybrid that changes between charge and discharge every minute
 /// would write too many rows. Remaining lives, and energy and power, have the same limit.
 const CAPACITIES: BucketSize = BucketSize { burst: 64.0, period_s: 3600.0 };
-/// Smallest change of a capacity or remaining life that is written even if the allowance is used up, in standard
+/// Minimum change of a capacity or remaining life that is written when the allowance is used up, in standard
 /// deviations.
 const MIN_CHANGE_STD: f64 = 0.25;
 /// How often deferred rows are written with a checkpoint or with other rows: 60 times at once (one hour of
 /// checkpoints), then once an hour. Each time, up to two rows per cell are written, which are kept for years.
 const CARRIED: BucketSize = BucketSize { burst: 60.0, period_s: 3600.0 };
 
-/// The capacity last written.
 #[derive(Debug, Clone, Copy)]
 struct WrittenCapacity {
     capacity_ah: f64,
@@ -49,7 +48,6 @@ pub(super) struct HistoryCommit {
     pub with_state: bool,
 }
 
-/// Selects the events that the history keeps.
 #[derive(Debug)]
 pub(super) struct HistoryFilter {
     written: BTreeMap<CellIndex, WrittenCapacity>,
@@ -94,12 +92,10 @@ impl HistoryFilter {
         Some(HistoryCommit { rows, with_state: urgency == Urgency::WithState })
     }
 
-    /// Returns what to commit at a checkpoint.
     pub(super) fn checkpoint(&mut self, now: Timestamp) -> HistoryCommit {
         HistoryCommit { rows: self.for_checkpoint(now), with_state: true }
     }
 
-    /// Returns what to commit when the program ends.
     pub(super) fn finish(&mut self) -> HistoryCommit {
         HistoryCommit { rows: std::mem::take(&mut self.deferred), with_state: true }
     }
@@ -110,7 +106,7 @@ impl HistoryFilter {
         if may_go { std::mem::take(&mut self.deferred) } else { Vec::new() }
     }
 
-    /// Defers a row. Of equal deferred rows, only the first and the last are kept.
+    /// Defers a row. If equal rows are deferred, keeps only the first and the last.
     fn defer(&mut self, kind: EventKind) {
         let row = HistoryRow::Event(kind);
         let same: Vec<usize> = (0..self.deferred.len()).filter(|&at| self.deferred[at] == row).collect();
@@ -205,7 +201,7 @@ impl Urgency {
             | EventKind::Model { .. }
             | EventKind::PackReplaced { .. }
             | EventKind::PackIdentity { .. }
-            // Requests after a restart depend on these two.
+            // The diagnostic requests after a restart depend on these two events.
             | EventKind::Command { command: Command::Poll { .. }, .. }
             | EventKind::Poll(PollChange::Silent { reason: PollSilence::OtherTester }) => Some(Self::WithState),
             EventKind::Alarm { change: Change::Suppressed | Change::Resumed, .. } => None,

@@ -1,5 +1,5 @@
-//! Reads from the history what a starting daemon restores. Alarm changes are read if they are newer than the stored
-//! state. If there is no valid state, learned values and all alarms are read. Only intact segments are read.
+//! Reads the part of the history that a starting daemon restores. Alarm changes are read if they are newer than the
+//! stored state. If there is no valid state, learned values and all alarms are read. Only intact segments are read.
 
 use rusqlite::{Connection, Row};
 
@@ -36,7 +36,7 @@ pub(super) fn alarm_changes(
     Ok(changes)
 }
 
-/// Returns the contents of a row of `alarm`; `None` = a version with other alarms wrote the row.
+/// Returns the contents of a row of `alarm`; `None` = the row was written by a version with other alarms.
 fn alarm_change(row: &Row<'_>) -> rusqlite::Result<Option<AlarmChange>> {
     let change: String = row.get("change")?;
     let is_dropped = change == DROPPED;
@@ -74,7 +74,6 @@ pub(super) fn read(connection: &Connection, pack: i64) -> rusqlite::Result<Vec<L
     Ok(cells)
 }
 
-/// The learned values in a row of `capacity`; `None` = the row has no capacity.
 fn learned(row: &Row<'_>) -> rusqlite::Result<Option<LearnedCell>> {
     let belief = |quantity: Quantity| -> rusqlite::Result<Option<ScalarGaussian>> {
         let Some(std_key) = quantity.row().std_key else { return Ok(None) };

@@ -17,7 +17,7 @@ use crate::config::VehicleIdentity;
 use crate::io::place::with_suffix;
 use crate::monitor::Snapshot;
 
-/// Largest size (bytes) of a database and its log that are copied for reading. A temporary folder has room for this
+/// Maximum size (bytes) of a database and its log that are copied for reading. A temporary folder has room for this
 /// size.
 const MAX_COPY_BYTES: u64 = 256 << 20;
 
@@ -111,17 +111,11 @@ impl HistoryReader {
     }
 
     /// The vehicle of the history, as last configured.
-    ///
-    /// # Errors
-    /// Fails if the file cannot be read.
     pub fn vehicle(&self) -> Result<VehicleIdentity, String> {
         database::vehicle(&self.connection).map_err(|error| self.named(&error))
     }
 
     /// How many half-cycles the store contains.
-    ///
-    /// # Errors
-    /// Fails if the file cannot be read.
     pub fn extent(&self) -> Result<HistoryExtent, String> {
         // A single statement reads all counts, so that a daemon cannot write in between.
         let sql = "SELECT (SELECT coalesce(max(id), 0) FROM pack), (SELECT count(*) FROM half_cycle), coalesce(sum(half_cycles * \
@@ -147,9 +141,6 @@ impl HistoryReader {
 
     /// Compares the history with `noted`, the end of the hash chain as it was once noted outside the store. Returns the
     /// contradiction; `None` = the history agrees.
-    ///
-    /// # Errors
-    /// Fails if the file cannot be read.
     pub fn contradiction(&self, noted: &NotedHead) -> Result<Option<String>, String> {
         self.at_once(|connection| segments::contradiction(connection, noted))
     }
@@ -207,9 +198,6 @@ impl HistoryReader {
     }
 
     /// The selected rows, in the order of writing.
-    ///
-    /// # Errors
-    /// Fails if the file cannot be read.
     pub fn entries(&self, filter: &HistoryQuery) -> Result<Vec<HistoryEntry>, String> {
         let mut entries = Vec::new();
         for kind in filter.wanted_kinds() {
@@ -224,9 +212,6 @@ impl HistoryReader {
     }
 
     /// Calls `take` with each selected row of one table, oldest first.
-    ///
-    /// # Errors
-    /// Fails if the file cannot be read.
     pub fn for_each(
         &self,
         kind: HistoryTable,
@@ -243,7 +228,7 @@ impl HistoryReader {
         order: &str,
         take: &mut dyn FnMut(HistoryEntry),
     ) -> rusqlite::Result<()> {
-        // A row without a readable time is read, too: it is damaged.
+        // Rows without a readable time are damaged. Select them too, so that they are counted.
         let sql = format!(
             "{} WHERE (?1 IS NULL OR r.cell = ?1) AND coalesce(m.wall_ns >= ?2, TRUE) AND coalesce(m.wall_ns <= ?3, TRUE) ORDER \
              BY r.seq {order} LIMIT ?4",
@@ -320,7 +305,6 @@ impl Drop for TemporaryCopy {
     }
 }
 
-/// Copies a database and its log into a new folder in the temporary folder.
 fn copy_to_temporary(path: &Path, max_bytes: u64) -> std::io::Result<TemporaryCopy> {
     let log_bytes = fs::metadata(with_suffix(path, "-wal")).map_or(0, |file| file.len());
     let bytes = fs::metadata(path)?.len() + log_bytes;

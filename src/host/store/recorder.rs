@@ -55,8 +55,8 @@ impl Recorder {
         })
     }
 
-    /// Writes the rows of the events of one input. If the events have no rows to write now, writes a checkpoint if one
-    /// is due.
+    /// Writes the rows of the events of one input. If there are no rows to write now and a checkpoint is due, writes
+    /// the checkpoint.
     pub fn record(&mut self, events: &[Event], monitor: &Monitor, now: Timestamp) -> Result<(), String> {
         let is_due = self.schedule.is_due(now, 0.0);
         match self.history_filter.take(events) {

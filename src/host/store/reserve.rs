@@ -1,8 +1,8 @@
 //! Reserves disk space for the time when the disk is full. The reserve is a file, which is shortened step by step so
 //! that learned results and alarms can be stored. The reserve is restored when the disk has room again.
 //!
-//! One step provides room for several commits. A state without new rows does not use the reserve; such a state waits
-//! until the disk has room.
+//! One step provides room for several commits. A state without new rows does not use the reserve, but waits until the
+//! disk has room.
 
 use std::fs::{self, File};
 use std::io::{self, Write};
@@ -12,29 +12,25 @@ use std::time::{Duration, Instant};
 
 use nix::libc::{O_NOFOLLOW, O_NONBLOCK};
 
-/// Name of the file in the state folder.
 const FILE_NAME: &str = "packwatch.reserve";
-/// Size of the file, bytes. This is the largest size of the write-ahead log.
+/// Size of the file, bytes: the maximum size of the write-ahead log.
 const BYTES: usize = 1 << 20;
 /// Bytes released at once. This is more than a commit writes, because another program that fills the disk may take some
 /// of the space.
 const STEP_BYTES: usize = 128 << 10;
 /// Name of the file that is written to find out whether the disk is full.
 const PROBE_NAME: &str = "packwatch.probe";
-/// Shortest time between two attempts to restore the reserve.
+/// Minimum time between two attempts to restore the reserve.
 const PAUSE: Duration = Duration::from_secs(15);
 
-/// The reserve of a folder.
 #[derive(Debug)]
 pub(super) struct Reserve {
     folder: PathBuf,
-    /// Size of the file, bytes.
     left: usize,
     tried: Option<Instant>,
 }
 
 impl Reserve {
-    /// The reserve of a folder, which may not exist yet.
     pub(super) fn new(folder: &Path) -> Self {
         let found = open(&folder.join(FILE_NAME)).and_then(|file| file.metadata()).map_or(0, |file| file.len());
         let left = usize::try_from(found).unwrap_or(BYTES).min(BYTES);
@@ -46,7 +42,6 @@ impl Reserve {
         self.left == BYTES
     }
 
-    /// Whether there is space left to release.
     pub(super) fn is_usable(&self) -> bool {
         self.left > 0
     }
@@ -60,14 +55,13 @@ impl Reserve {
         self.make();
     }
 
-    /// Extends the file to its full size.
     pub(super) fn make(&mut self) {
         if self.is_whole() {
             return;
         }
         let path = self.folder.join(FILE_NAME);
         if fs::symlink_metadata(&path).is_ok_and(|found| !found.is_file()) {
-            // Something else has the name.
+            // Remove a file of another kind that has this name.
             let _ = fs::remove_file(&path);
         }
         let is_missing = !path.exists();
@@ -92,7 +86,6 @@ impl Reserve {
         self.is_usable() && self.is_disk_full() && self.release()
     }
 
-    /// Tries to write one step to the probe file.
     fn is_disk_full(&self) -> bool {
         let path = self.folder.join(PROBE_NAME);
         let _ = fs::remove_file(&path);
@@ -116,7 +109,8 @@ impl Reserve {
     }
 }
 
-/// Opens the reserve. Fails if it is a symbolic link, which may lead to a file of another program, or no regular file.
+/// Opens the reserve. Fails if it is not a regular file. Also fails if it is a symbolic link, because the link may
+/// lead to a file of another program.
 fn open(path: &Path) -> io::Result<File> {
     let file = File::options().append(true).custom_flags(O_NOFOLLOW | O_NONBLOCK).open(path)?;
     let is_file = file.metadata()?.is_file();

@@ -14,7 +14,6 @@ use crate::quantity::catalogue::{RecordedPackValues, RecordedValues};
 /// Value of `change` for an alarm that ended because no threshold monitors it any longer.
 pub(super) const DROPPED: &str = "dropped";
 
-/// One row to write.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum HistoryRow {
     /// An event of the core: a half-cycle, a capacity, a new cell model, an alarm, a filter reset, another pack.
@@ -23,17 +22,13 @@ pub(super) enum HistoryRow {
     Own {
         /// Name of the event, such as `damaged`, `state_damaged` or `rows_lost`.
         reason: &'static str,
-        /// Details for the reader.
         detail: String,
     },
 }
 
-/// Rows written at one moment.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct RowBatch {
-    /// Moment at which the rows are written.
     pub stamp: Stamp,
-    /// The rows, in the order of the events.
     pub rows: Vec<HistoryRow>,
 }
 
@@ -71,7 +66,6 @@ impl HistoryTable {
         Self::Reset,
     ];
 
-    /// SQL type of a column.
     pub(super) fn sql_type(column: &str) -> &'static str {
         match column {
             "mode" | "state" | "chemistry" | "rule" | "severity" | "change" | "reason" | "detail" => "TEXT",
@@ -99,7 +93,8 @@ impl HistoryTable {
         static CAPACITY: LazyLock<Vec<&str>> = LazyLock::new(|| {
             ["cell", "measured_ah", "measured_std_ah"].into_iter().chain(RecordedValues::keys()).collect()
         });
-        // The pack has no number. As in the other tables, the first column contains the cell, here always NULL.
+        // These values belong to the pack. As in the other tables, the first column contains the cell, here always
+        // NULL.
         static OUTLOOK: LazyLock<Vec<&str>> =
             LazyLock::new(|| ["cell"].into_iter().chain(RecordedPackValues::keys()).collect());
         match self {

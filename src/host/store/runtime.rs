@@ -1,7 +1,7 @@
 //! Writes the state to the runtime folder every second, so that a crash of the daemon alone loses at most one second.
 //!
 //! The folder is in memory and exists until the computer restarts (systemd keeps it over restarts of the service). A
-//! separate thread writes the latest state, so that a slow disk does not delay this state.
+//! separate thread writes the latest state, so that the state does not wait for a slow disk.
 
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
@@ -10,10 +10,8 @@ use std::thread::JoinHandle;
 
 use super::state_files::StateDocument;
 
-/// Name of the state file in the runtime folder.
 pub(super) const FILE_NAME: &str = "state.json";
 
-/// Writes the runtime state.
 #[derive(Debug)]
 pub(super) struct RuntimeState {
     latest: Arc<Mutex<Option<StateDocument>>>,
@@ -23,7 +21,6 @@ pub(super) struct RuntimeState {
 }
 
 impl RuntimeState {
-    /// Starts the thread that writes `path`.
     pub(super) fn start(path: PathBuf) -> std::io::Result<Self> {
         let (latest, (wake, woken)) = (Arc::default(), sync_channel(1));
         let theirs = Arc::clone(&latest);

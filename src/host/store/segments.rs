@@ -1,13 +1,14 @@
 //! Divides the history into segments, chains the rows by hash, and verifies the chain. A segment contains the rows of a
 //! day, but at most about 10,000 rows.
 //!
-//! Every row has a number, counted across the tables, and a check code: the first eight bytes of its SHA-256 hash. The
-//! code reveals a changed row when it is read. The hash of a segment is a chain over its rows, which starts from the
-//! hash of the segment before. The chain reveals rows that were changed, removed, inserted or moved. The
-//! number of segments is stored separately; this number reveals missing segments at the end. The oldest segments are
-//! deleted as a whole but keep their hashes, so the remaining segments can still be verified. A person who can write
-//! the file can recompute the whole chain. A copy of the chain's end that is kept elsewhere reveals a recomputed chain
-//! ([`contradiction`]).
+//! Every row has a number, counted across the tables, and a check code: the first eight bytes of its SHA-256 hash.
+//! The code reveals a changed row when it is read. The hash of a segment is a chain over its rows, which starts from
+//! the hash of the previous segment. The chain reveals rows that were changed, removed, inserted or moved. The number
+//! of segments is stored separately, to reveal missing segments at the end. The oldest segments are deleted as a
+//! whole but keep their hashes, so the remaining segments can still be verified.
+//!
+//! A person who can write the file can recompute the whole chain. A copy of the chain's end that is kept elsewhere
+//! reveals a recomputed chain ([`contradiction`]).
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -23,33 +24,26 @@ use super::database::is_damage;
 use super::rows::HistoryTable;
 use super::stamp::{BootId, SANE_WALL_NS, Stamp};
 
-/// A SHA-256 hash.
 pub(super) type Hash = [u8; 32];
 
-/// Nanoseconds in a day.
 pub(super) const NS_PER_DAY: i64 = 86_400_000_000_000;
 /// Number of rows after which a segment ends. The batch that reaches this number is still added to the segment.
 /// Deleting this many rows takes about 0.1 s.
 const MAX_ROWS: i64 = 10_000;
 
-/// A segment.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Segment {
     /// Number of the segment, from 1; 0 = the start before the first segment.
     pub id: i64,
     /// Day on the wall clock, counted from 1970-01-01.
     pub day: i64,
-    /// Number of the first row.
     pub first: i64,
-    /// Number of the last row.
     pub last: i64,
     /// Number of the last row's moment (a row of the table `moment`).
     pub last_moment: i64,
-    /// Number of half-cycles among the rows.
     pub half_cycles: i64,
     /// Whether the rows were deleted because of the limits on rows and age.
     pub is_deleted: bool,
-    /// Hash of the last row.
     pub hash: Hash,
 }
 
@@ -74,7 +68,6 @@ impl Segment {
         })
     }
 
-    /// The newest segment.
     pub(super) fn newest(connection: &Connection) -> rusqlite::Result<Self> {
         let sql = format!("SELECT {COLUMNS} FROM segment ORDER BY id DESC LIMIT 1");
         Ok(connection.query_row(&sql, [], Self::of_row).optional()?.unwrap_or(Self::START))
@@ -98,7 +91,6 @@ impl Segment {
         Ok(next)
     }
 
-    /// Writes a row and appends it to the segment.
     pub(super) fn write_row(
         &mut self,
         connection: &Connection,
@@ -122,7 +114,6 @@ impl Segment {
         connection.prepare_cached(&sql)?.execute(rusqlite::params_from_iter(bound)).map(drop)
     }
 
-    /// Writes the segment itself, after its rows.
     pub(super) fn write(&self, connection: &Connection) -> rusqlite::Result<()> {
         let Self { id, day, first, last, last_moment, half_cycles, is_deleted, hash } = self;
         connection
@@ -134,7 +125,7 @@ impl Segment {
     /// Computes the hash of row `last` from the stored rows.
     fn hash_to(&self, connection: &Connection, before: &Hash, last: i64) -> rusqlite::Result<Hash> {
         let mut rows: BTreeMap<(i64, HistoryTable), (Hash, i64)> = BTreeMap::new();
-        // The number is bounded, so that a damaged number does not fill the memory.
+        // Limit the number, so that a damaged number does not fill the memory.
         let last = last.min(self.first.saturating_add(MAX_ROWS + backlog::MAX_ROWS as i64));
         for table in HistoryTable::ALL {
             let sql = format!("{} WHERE r.seq BETWEEN ?1 AND ?2", StoredRow::select(table));
@@ -149,7 +140,7 @@ impl Segment {
     }
 }
 
-/// What a row's check and the chain need.
+/// Number, hash and check code of a stored row.
 pub(super) struct StoredRow {
     pub seq: i64,
     hash: Hash,
@@ -169,7 +160,7 @@ impl StoredRow {
         )
     }
 
-    /// Computes the hash of a selected row. A value of a wrong type changes the hash and is no error.
+    /// Computes the hash of a selected row. A value of a wrong type changes the hash, but is not an error.
     pub(super) fn read(table: HistoryTable, row: &Row<'_>) -> rusqlite::Result<Self> {
         let seq = row.get(0)?;
         let values = (2..Self::COLUMNS + table.columns().len()).map(|index| row.get_ref(index));
@@ -207,7 +198,6 @@ fn row_hash<'v>(table: HistoryTable, seq: i64, values: impl IntoIterator<Item = 
     hasher.finalize().into()
 }
 
-/// The check code of a row: the first eight bytes of its hash.
 fn check_code(hash: &Hash) -> i64 {
     let [a, b, c, d, e, f, g, h, ..] = *hash;
     i64::from_le_bytes([a, b, c, d, e, f, g, h])
@@ -224,7 +214,6 @@ fn update_bytes(hasher: &mut Sha256, tag: u8, bytes: &[u8]) {
     hasher.update(bytes);
 }
 
-/// Formats a hash in hexadecimal digits.
 pub(super) fn hex(hash: &[u8]) -> String {
     hash.iter().map(|byte| format!("{byte:02x}")).collect()
 }
@@ -234,7 +223,7 @@ fn pairs(connection: &Connection) -> rusqlite::Result<Vec<(Segment, Segment)>> {
     let (mut before, mut pairs) = (Segment::START, Vec::new());
     let mut statement = connection.prepare(&format!("SELECT {COLUMNS} FROM segment ORDER BY id"))?;
     for segment in statement.query_map([], Segment::of_row)? {
-        // A segment with a value of a wrong type breaks the chain.
+        // If a value has a wrong type, use a segment that breaks the chain.
         let next = before.last.saturating_add(1);
         let damaged = Segment { id: before.id.saturating_add(1), first: next, last: next, ..Segment::START };
         let segment = segment.or_else(|error| if is_damage(&error) { Ok(damaged) } else { Err(error) })?;
@@ -244,9 +233,9 @@ fn pairs(connection: &Connection) -> rusqlite::Result<Vec<(Segment, Segment)>> {
     Ok(pairs)
 }
 
-/// Deletes the rows of the oldest segment that still has rows, if the history has more than `max_rows` rows or if any
-/// segment but the newest ended before `horizon_ns`. If a segment has the time of an unset wall clock, its time is not
-/// compared. Such a segment is deleted when a later segment ended before `horizon_ns`.
+/// Deletes the rows of the oldest segment that still has rows. Does so if the history has more than `max_rows` rows,
+/// or if any segment except the newest ended before `horizon_ns`. A segment that was written with an unset wall clock
+/// is not compared with `horizon_ns`. It is deleted when a later segment ended before `horizon_ns`.
 pub(super) fn delete_oldest(
     connection: &Connection,
     newest: &Segment,
@@ -310,7 +299,6 @@ impl fmt::Display for BrokenSegment {
     }
 }
 
-/// Verifies the chain, segment by segment.
 pub(super) fn verify(connection: &Connection) -> rusqlite::Result<ChainReport> {
     let noted =
         connection.query_row("SELECT segments FROM meta", [], |row| Ok(row.get_ref(0)?.as_i64().unwrap_or(-1)))?;

@@ -1,14 +1,11 @@
 //! Stores the time of a state as shown by every clock, and computes the age of the state at a later time.
 //!
-//! The wall clock of a vehicle computer may show 1970 until it is set, and it may step. The boot clock never steps, but
-//! it starts again with every boot. Therefore the times of both clocks are stored, together with the identity of the
-//! boot.
+//! The wall clock of a vehicle computer may show 1970 until it is set, and it may step. The boot clock never steps,
+//! but starts again with every boot. Therefore both times are stored, together with the identity of the boot.
 //!
-//! Only the wall clock can measure the age of a state from an earlier boot. The measured age is right only if a
-//! hardware clock ran while the computer was off. Without a battery-backed clock, the wall clock continues from its
-//! last saved value (systemd saves this value at every boot). A week without power then looks like seconds, and the
-//! wall clock itself does not show that it is wrong. The wall clock is therefore trusted only if a hardware clock
-//! agrees with it ([`WallClock`]) or a time server has set it.
+//! Only the wall clock can measure the age of a state from an earlier boot. Without a battery-backed hardware clock,
+//! it continues from the value that systemd saved last. A week without power then looks like seconds. The wall clock
+//! is therefore trusted only if a hardware clock agrees with it ([`WallClock`]) or a time server has set it.
 
 use std::fmt;
 use std::path::Path;
@@ -22,15 +19,14 @@ use crate::quantity::Timestamp;
 /// A wall clock before this time (2024-01-01) has not been set.
 pub(super) const SANE_WALL_NS: i64 = 1_704_067_200_000_000_000;
 
-/// Nanoseconds in a year of 365.25 days.
 const NS_PER_YEAR: f64 = 365.25 * 86_400.0 * 1e9;
 
 /// The kernel's list of hardware clocks. A sandbox that forbids `adjtimex` can read it.
 const HARDWARE_CLOCKS: &str = "/sys/class/rtc";
 /// systemd's time client creates this file when a time server has set the clock since the boot.
 const SYNCHRONISED: &str = "/run/systemd/timesync/synchronized";
-/// Largest difference between the wall clock and a hardware clock that confirms it (s). A hardware clock counts whole
-/// seconds and drifts a few seconds a day, and the wall clock may have been corrected since the boot.
+/// Maximum difference between the wall clock and a hardware clock that confirms it (s). A hardware clock counts whole
+/// seconds and drifts by a few seconds a day. The wall clock may have been corrected since the boot.
 const HARDWARE_TOLERANCE_S: i64 = 60;
 
 /// One boot of one computer, as identified by the kernel.
@@ -53,7 +49,7 @@ impl BootId {
         let text = std::fs::read_to_string("/proc/sys/kernel/random/boot_id").ok();
         let kernel = text.and_then(|text| Self::parse(&text));
         let variable = || std::env::var(BOOT_ID_VARIABLE).ok().and_then(|text| Self::parse(&text));
-        // If the boot is unknown, the result never counts as equal to another unknown boot.
+        // An unknown boot never counts as equal to another unknown boot.
         kernel.or_else(variable).unwrap_or(Self::UNKNOWN)
     }
 
@@ -93,7 +89,6 @@ pub(super) struct Stamp {
     pub time: Timestamp,
     /// Time since this boot, including suspend, ns.
     pub boottime_ns: i64,
-    /// The boot.
     pub boot: BootId,
 }
 
@@ -107,8 +102,8 @@ pub(super) enum WallClock {
 }
 
 impl WallClock {
-    /// Assesses the wall clock at the start. A GPS receiver or time server that sets the clock later is too late,
-    /// because the age of the state is determined only once.
+    /// Assesses the wall clock at the start. A later setting by a GPS receiver or time server has no effect, because
+    /// the age of the state is determined only once.
     pub(super) fn assess(now: &Stamp) -> Self {
         Self::judge(now, Path::new(HARDWARE_CLOCKS), Path::new(SYNCHRONISED))
     }
@@ -145,7 +140,6 @@ impl Stamp {
     /// The wall-clock time this many years ago, ns since 1970; `None` = the wall clock is not confirmed.
     pub(super) fn years_ago_ns(&self, years: f64) -> Option<i64> {
         let is_reliable = self.boot == BootId::REPLAY || WallClock::assess(self) == WallClock::Reliable;
-        // The cast saturates.
         is_reliable.then(|| self.wall_ns.saturating_sub((years * NS_PER_YEAR) as i64))
     }
 

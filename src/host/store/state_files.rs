@@ -28,7 +28,6 @@ use crate::monitor::Snapshot;
 
 /// The format that this program reads and writes.
 pub(super) const FORMAT: u32 = 1;
-/// Names of the files.
 pub(super) const FILES: [&str; 2] = ["state-a.json.zst", "state-b.json.zst"];
 /// Name of the file of a state that was set aside.
 pub(super) const ASIDE: &str = "state-aside.json.zst";
@@ -39,15 +38,13 @@ pub(super) const SET_ASIDE: &str = "set aside for the first start at which it fi
 /// Compression level. The level is low because announcements wait for the compression. Level 19 makes files a sixth
 /// smaller and takes fifty times as long.
 const LEVEL: i32 = 1;
-/// Largest size of the JSON, bytes: ten times the size for the largest pack.
+/// Maximum size of the JSON, bytes: ten times the size for the largest pack.
 const MAX_JSON_BYTES: u64 = 64 << 20;
 /// Head of the frame that contains the hash: the magic number of a skippable zstd frame, and the length of the hash.
 const HASH_HEAD: [u8; 8] = [0x50, 0x2A, 0x4D, 0x18, 32, 0, 0, 0];
 
-/// A stored state, with its time, its state folder and the number of its pack.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub(super) struct StateDocument {
-    /// [`FORMAT`].
     pub format: u32,
     /// Number of the state, counting all written states.
     pub number: i64,
@@ -57,9 +54,7 @@ pub(super) struct StateDocument {
     pub pack: i64,
     /// Number of rows in the history when the state was taken.
     pub history_rows: i64,
-    /// Time when the state was taken.
     pub stamp: Stamp,
-    /// The core's state.
     pub snapshot: Box<Snapshot>,
 }
 
@@ -73,7 +68,6 @@ pub(super) enum StateFault {
 }
 
 impl StateDocument {
-    /// Parses JSON.
     pub(super) fn parse(json: &[u8]) -> Result<Self, StateFault> {
         #[derive(Deserialize)]
         struct Head {
@@ -87,7 +81,7 @@ impl StateDocument {
         serde_json::from_slice(json).map_err(unfit)
     }
 
-    /// Writes JSON to a temporary name and renames it. The file is not synced, because it is in memory.
+    /// Writes JSON to a temporary name and renames it. The file is in memory, so it is not synced.
     pub(super) fn write_json(&self, path: &Path) -> io::Result<()> {
         let part = path.with_extension("json.part");
         fs::write(&part, serde_json::to_vec(self)?)?;
@@ -112,7 +106,6 @@ impl StateDocument {
         Ok(file)
     }
 
-    /// Decodes the contents of a file.
     fn decode(file: &[u8]) -> Result<Self, StateFault> {
         let damaged = |why: &str| StateFault::Damaged(why.to_owned());
         let (frame, hash) = file
@@ -139,7 +132,6 @@ impl StateDocument {
     }
 }
 
-/// Writes numbers that are [`rounded`].
 struct Rounding(CompactFormatter);
 
 impl Formatter for Rounding {
@@ -165,18 +157,14 @@ pub(super) struct StateFiles {
     folder: PathBuf,
     /// Index in [`FILES`] of the file that the next state is written to.
     next: usize,
-    /// Number of the latest state.
     number: i64,
     /// Index in [`FILES`] of a state that the next write sets aside first; `None` = no state.
     aside: Option<usize>,
 }
 
-/// The states of a folder.
 #[derive(Debug, Default)]
 pub(super) struct FoundStates {
-    /// The newest valid state.
     pub newest: Option<StateDocument>,
-    /// The state that was set aside.
     pub aside: Option<StateDocument>,
     /// Faults of the files, for the history.
     pub faults: Vec<HistoryRow>,
@@ -246,7 +234,6 @@ impl StateFiles {
     }
 }
 
-/// Deletes the states of a folder.
 pub(super) fn forget(folder: &Path) -> io::Result<()> {
     for name in FILES.into_iter().chain([ASIDE]) {
         match fs::remove_file(folder.join(name)) {

@@ -66,7 +66,6 @@ fn snapshot(seconds: Option<i64>, store: Option<Recorder>) -> Snapshot {
     replay::run(&mut source, monitor, Sinks::default(), settings, &mut |_| {}).unwrap().1.unwrap()
 }
 
-/// Returns a monitor that has restored the state.
 fn restored(snapshot: Snapshot) -> Monitor {
     let mut monitor = Monitor::new(config().monitor);
     let time = snapshot.time;
@@ -75,7 +74,6 @@ fn restored(snapshot: Snapshot) -> Monitor {
     monitor
 }
 
-/// Reads the newest state in a folder.
 fn stored(folder: &Path) -> StateDocument {
     StateFiles::open(folder).1.newest.unwrap()
 }
@@ -144,7 +142,7 @@ fn state_of_replaced_pack_is_not_restored() {
     assert_eq!(open(None).0.len(), 0);
     assert_eq!(open(Some(1)).0.len(), 0, "the runtime state of the old pack is not restored either");
     assert_eq!(open(Some(2)).0, ["runtime folder"]);
-    // A lost history does not bring back the old state either.
+    // If the history is lost, the old state is not restored either.
     std::fs::remove_file(place.path().join(DATABASE)).unwrap();
     assert_eq!(open(Some(2)).0, ["runtime folder"]);
     assert_eq!(open(Some(0)).0, ["runtime folder", STATE_SOURCE], "the pack is unknown");
@@ -164,7 +162,6 @@ fn rows_missing_in_history_are_reported() {
     assert!(!opened.found.works && opened.found.states.len() == 1);
 }
 
-/// The writer of a folder, without its thread.
 fn writer(folder: &Path) -> Writer {
     Writer {
         write_queue: Arc::default(),
@@ -347,7 +344,6 @@ fn deleted_states_are_written_with_next_rows() {
     assert!(commit(&mut writer).is_some() && StateFiles::open(place.path()).1.newest.is_some());
 }
 
-/// Returns a monitor whose time is `seconds`.
 fn at(seconds: f64) -> Monitor {
     let mut monitor = Monitor::new(config().monitor);
     monitor.handle(&Record::tick(Timestamp::from_secs(seconds)), &mut Outputs::default());

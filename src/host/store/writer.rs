@@ -26,9 +26,9 @@ use super::state_files::{StateDocument, StateFiles};
 use crate::config::VehicleIdentity;
 use crate::quantity::Timestamp;
 
-/// First pause after a failure. Each further pause is twice as long as the pause before.
+/// First pause after a failure. Each further pause is twice as long.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
-/// Longest pause. If the disk works again, the writer detects it within this time.
+/// Maximum pause. If the disk works again, the writer detects it within this time.
 const LAST_PAUSE: Duration = Duration::from_secs(15);
 
 /// Progress of the writer.
@@ -72,15 +72,12 @@ struct QueueState {
     /// Whether the stored state must be set aside before the next state is written.
     sets_aside: bool,
     ticket: u64,
-    /// Whether the writer has work.
     wanted: bool,
     stop: bool,
 }
 
-/// Work that the writer takes from the queue in one step.
 struct PendingWrite {
     batches: Vec<RowBatch>,
-    /// The state after these rows.
     state: Option<StateDocument>,
     is_state_due: bool,
     sets_aside: bool,
@@ -124,7 +121,6 @@ impl WriteQueue {
         self.wake.notify_one();
     }
 
-    /// Ticket of the last submission.
     #[cfg(test)]
     pub(super) fn submitted(&self) -> u64 {
         self.lock().ticket
@@ -135,7 +131,6 @@ impl WriteQueue {
         self.lock().backlog.lost()
     }
 
-    /// Waits for work or for the time of the next retry, then takes all queued work.
     fn take(&self, retry_at: Option<Instant>) -> PendingWrite {
         let mut queue = self.lock();
         while !queue.wanted {
@@ -161,16 +156,13 @@ impl WriteQueue {
     }
 }
 
-/// The writer thread.
 #[derive(Debug)]
 pub(super) struct Writer {
     pub(super) write_queue: Arc<WriteQueue>,
-    /// Vehicle of the history.
     pub(super) vehicle: VehicleIdentity,
     pub(super) limits: RowLimits,
     pub(super) folder: Folder,
     pub(super) state_files: StateFiles,
-    /// Reserve for a full disk.
     pub(super) reserve: Reserve,
     /// Latest day (UTC, since 1970) whose chain end was logged.
     pub(super) head_day: Option<i64>,
@@ -186,7 +178,6 @@ pub(super) struct Writer {
     pub(super) was_replaced: bool,
 }
 
-/// Time of the next attempt after a failure.
 #[derive(Debug, Default)]
 pub(super) struct Retry {
     pause: Option<Duration>,
@@ -194,7 +185,6 @@ pub(super) struct Retry {
 }
 
 impl Retry {
-    /// Schedules the next attempt after an attempt has failed.
     pub(super) fn after_failure(&mut self) {
         let pause = self.pause.map_or(FIRST_PAUSE, |pause| (2 * pause).min(LAST_PAUSE));
         (self.pause, self.at) = (Some(pause), Some(Instant::now() + pause));
@@ -283,9 +273,9 @@ impl Writer {
         }
     }
 
-    /// Calls [`Writer::commit`]. If rows cannot be written, tries again after each step that the reserve releases. Also
-    /// tries again once without a release: space may be available again, and a second attempt sets a damaged database
-    /// aside.
+    /// Calls [`Writer::commit`]. If rows cannot be written, tries again after each step that the reserve releases.
+    /// Also tries again once without a release, because space may be available again, and because a second attempt
+    /// sets a damaged database aside.
     fn commit_urgently(
         &mut self,
         batches: &mut Vec<RowBatch>,
@@ -375,7 +365,6 @@ impl Writer {
         }
     }
 
-    /// Returns the database, and opens it first if necessary.
     fn open(&mut self, now: &Stamp) -> Result<&mut Database, String> {
         let database = match self.database.take() {
             Some(database) => database,
@@ -397,7 +386,7 @@ impl Writer {
             self.state_files = files;
             rows.extend(found.faults);
             if found.newest.is_some() {
-                // The disk became available after the daemon had started without this state. The state is kept for the
+                // The disk became available after the daemon had started without this state. Keep the state for the
                 // user.
                 self.state_files.set_aside();
                 tracing::error!(folder = %self.folder, "stored state found after the start: set aside, not used");

@@ -1,9 +1,9 @@
-//! Tries the changes that a report proposes: applies them to the text of the configuration in memory and judges the same
-//! input again.
+//! Tries the changes that a report proposes: applies them to the text of the configuration in memory and judges the
+//! same input again. No file is written.
 //!
 //! In: the report and a function that judges the input with another configuration. Out: each finding states whether its
-//! change alone removes it without another error or warning. Alternatives are tried one by one. A change that does not
-//! help is removed from the report, so that nobody follows it. Nothing is written.
+//! change alone removes the finding without another error or warning. Alternatives are tried one by one. A change that
+//! does not help is removed from the report, so that the reader does not apply it.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -16,8 +16,8 @@ use crate::wiring::{Change, Severity, Topic, WiringFinding, WiringReport};
 /// Maximum number of trials, because every trial reads the logs again.
 const MAX_TRIALS: usize = 4;
 
-/// Tries the changes of the first findings. `judge` judges the input with another configuration; `None` = it cannot be
-/// judged again.
+/// Tries the changes of the first findings. `judge` judges the input with another configuration. It returns `None` if
+/// the input cannot be judged again.
 pub fn try_changes(
     config: &Path,
     report: &mut WiringReport,
@@ -33,7 +33,7 @@ pub fn try_changes(
             let is_exact = left > 0 && group.iter().all(is_exact);
             let outcome = match if is_exact { changed(config, group) } else { None } {
                 Some(survey) if survey.faults.len() > faults => Outcome::Useless,
-                // Without a valid configuration, not every check runs.
+                // With an invalid configuration, some checks do not run, so the outcome would be unknown.
                 Some(mut survey) if survey.faults.is_empty() => {
                     left -= 1;
                     judge(&mut survey).map_or(Outcome::Untried, |other| Outcome::of(&before, &own, &other))
@@ -51,12 +51,11 @@ pub fn try_changes(
     }
 }
 
-/// Result of the trial of one proposal.
 enum Outcome {
     Untried,
-    /// The finding disappears, and no other appears.
+    /// The finding disappears, and no other finding appears.
     Solved,
-    /// The finding disappears, but another one with this title appears.
+    /// The finding disappears, but another finding with this title appears.
     Exchanged(String),
     Useless,
 }
@@ -90,7 +89,7 @@ fn keep(finding: &mut WiringFinding, changes: &[Change], outcome: Outcome) {
         let is_first = finding.changes.is_empty();
         finding.changes.extend_from_slice(changes);
         if is_first {
-            // Without the proposals before it, this one is no alternative.
+            // An alternative follows another proposal. This change is now the first, so it is not an alternative.
             finding.changes[0].is_alternative = false;
         }
     }
@@ -112,7 +111,7 @@ fn counts(report: &WiringReport) -> BTreeMap<Subject, usize> {
     counts
 }
 
-/// Whether the change states a value, and not only a description.
+/// Whether the change states a value instead of only a description.
 fn is_exact(change: &Change) -> bool {
     change.place.is_some() && toml::from_str::<toml::Table>(&format!("{} = {}", change.key, change.proposed)).is_ok()
 }
@@ -125,7 +124,7 @@ fn changed(config: &Path, changes: &[Change]) -> Option<Survey> {
         let (file, line) = change.place.as_ref()?.rsplit_once(':')?;
         placed.push((PathBuf::from(file), line.parse().ok()?, change));
     }
-    // From the last line to the first, so that inserted lines do not move the lines of other changes.
+    // Changes are applied from the last line to the first, so that inserted lines do not move other lines to change.
     placed.sort_by_key(|(_, line, _)| std::cmp::Reverse(*line));
     for (file, line, change) in placed {
         if !texts.contains_key(&file) {
@@ -141,7 +140,8 @@ fn changed(config: &Path, changes: &[Change]) -> Option<Survey> {
     survey_with(config, &read).ok()
 }
 
-/// Replaces the line of the key, or inserts a line below the header of the table. `None` if the line has another form.
+/// Replaces the line of the key, or inserts a line below the header of the table. Returns `None` if the line has
+/// another form.
 fn apply(lines: &mut Vec<String>, line: usize, change: &Change) -> Option<()> {
     let text = lines.get(line.checked_sub(1)?)?;
     let new = format!("{} = {}", change.key, change.proposed);

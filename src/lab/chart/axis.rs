@@ -7,14 +7,13 @@ use crate::quantity::Timestamp;
 const MINUTE: f64 = 60.0;
 const HOUR: f64 = 3600.0;
 const DAY: f64 = 86_400.0;
-/// Steps of a date axis that are shorter than a month: unit of the step (s) and the allowed multiples of the unit.
+/// Steps of a date axis below a month: unit (s) and the allowed multiples of the unit.
 const STEPS: [(f64, &[f64]); 4] = [
     (1.0, &[1.0, 5.0, 15.0, 30.0]),
     (MINUTE, &[1.0, 5.0, 15.0, 30.0]),
     (HOUR, &[1.0, 2.0, 3.0, 4.0, 6.0, 12.0]),
     (DAY, &[1.0, 2.0, 5.0, 10.0, 20.0]),
 ];
-/// Length of an average month (s).
 const MONTH_S: f64 = 30.44 * DAY;
 
 /// Scale of an axis.
@@ -52,18 +51,17 @@ impl Axis {
         Self { range: Some((low, high)), ..self }
     }
 
-    /// Returns the ends of the axis for these values. The two ends always differ. If `margin` is set, both ends get
-    /// additional room.
+    /// Returns the ends of the axis for these values; they always differ. If `margin` is set, both ends get additional
+    /// room.
     pub(super) fn ends(&self, values: impl Iterator<Item = f64>, margin: bool) -> (f64, f64) {
         if let Some(range) = self.range {
             return widened(range, 0.0);
         }
         let ends = ends(values.filter(|value| value.is_finite()));
-        // Room above and below the data, as a share of their range.
+        // Room at each end, as a share of the range of the data.
         widened(ends, if margin { 0.06 } else { 0.0 })
     }
 
-    /// Positions and labels of about `count` ticks.
     pub(super) fn ticks(&self, ends: (f64, f64), count: f64) -> Vec<(f64, String)> {
         match self.scale {
             Scale::Number => number_ticks(ends, count),
@@ -71,8 +69,7 @@ impl Axis {
         }
     }
 
-    /// Returns the label of the axis. For dates, the label includes the days at both ends, because the ticks may be
-    /// hours.
+    /// Returns the label of the axis. For dates, it includes the days at both ends, because the ticks may be hours.
     pub(super) fn caption(&self, ends: (f64, f64)) -> String {
         match self.scale {
             Scale::Number => self.label.clone(),
@@ -81,13 +78,12 @@ impl Axis {
     }
 }
 
-/// Widens a range so that it is not empty and has room at both ends.
 fn widened((low, high): (f64, f64), margin: f64) -> (f64, f64) {
     if low > high {
         return (0.0, 1.0);
     }
     let width = high - low;
-    // If the range is too narrow for distinct ticks, add room around the value.
+    // A range that is too narrow for distinct ticks gets room around the value.
     let room = if width <= 1e-9 * low.abs().max(1e-3) { 0.5 * low.abs().clamp(1.0, 3600.0) } else { margin * width };
     (low - room, high + room)
 }
@@ -98,11 +94,11 @@ fn number_ticks((low, high): (f64, f64), count: f64) -> Vec<(f64, String)> {
     let step = [1.0, 2.0, 5.0, 10.0].into_iter().find(|m| m * power >= raw).unwrap_or(10.0) * power;
     let decimals = (-step.log10().floor()).max(0.0) as usize;
     let first = (low / step).ceil();
-    // The step is chosen so that there are at most `count` + 1 ticks.
+    // With this step, there are at most `count` + 1 ticks.
     (0..=count.ceil() as usize)
         .map(|index| (first + index as f64) * step)
         .take_while(|value| *value <= high + 1e-9 * step)
-        // Avoids "-0".
+        // This avoids "-0".
         .map(|value| if value.abs() < 1e-9 * step { 0.0 } else { value })
         .map(|value| (value, format!("{value:.decimals$}").replace('-', "\u{2212}")))
         .collect()
@@ -144,7 +140,7 @@ fn month_ticks((low, high): (f64, f64), raw: f64) -> Vec<(f64, String)> {
         .collect()
 }
 
-/// Formats a time with the precision of the step; at midnight, the date is shown instead of the time.
+/// Formats a time with the precision of the step. At midnight, the date replaces the time.
 fn moment(time_s: f64, step: f64) -> String {
     let text = format_utc(Timestamp::from_secs(time_s));
     let part = if step >= DAY || (step >= MINUTE && time_s.rem_euclid(DAY) == 0.0) {
@@ -157,7 +153,6 @@ fn moment(time_s: f64, step: f64) -> String {
     text.get(part).unwrap_or_default().to_owned()
 }
 
-/// The day of a time.
 pub(super) fn day(time_s: f64) -> String {
     format_utc(Timestamp::from_secs(time_s)).get(..10).unwrap_or_default().to_owned()
 }

@@ -5,10 +5,10 @@ use std::path::Path;
 use super::style::variables;
 use super::{Picture, Size, escape};
 
-/// Space around a picture in a file, pixels.
+/// Space around a picture in a file (pixels).
 const MARGIN: f64 = 14.0;
 
-/// Error of a plot that cannot be written.
+/// A plot that cannot be written.
 #[derive(Debug, thiserror::Error)]
 #[error("{path}: the plot cannot be written: {what}")]
 pub struct PlotError {
@@ -36,7 +36,6 @@ pub fn write_stack(path: &Path, pictures: &[Picture]) -> Result<(), PlotError> {
     crate::write_file(path, document(pictures).as_bytes()).map_err(failed)
 }
 
-/// An SVG document.
 fn document(pictures: &[Picture]) -> String {
     let style = variables();
     let mut body = String::new();

@@ -1,15 +1,14 @@
-//! Draws lines, bands (points) and thresholds over one pair of axes.
+//! Draws lines, bands, points and thresholds over one pair of axes.
 
 use super::axis::Axis;
 use super::style::Ink;
 use super::svg::{PathBuilder, Svg, short, text_width};
 use super::{Size, thin};
 
-/// Font size of ticks and legend, pixels, as in the style sheet.
+/// Font size of ticks and legend (pixels), as in the style sheet.
 const SMALL: f64 = 11.5;
 const ROW: f64 = 18.0;
 const FOOT: f64 = 38.0;
-/// Radius of a point, pixels.
 const DOT: f64 = 2.6;
 
 /// A value drawn as a point.
@@ -31,7 +30,7 @@ pub enum Shape {
     /// Band of (x, lower, upper).
     Band(Vec<(f64, f64, f64)>),
     Points(Vec<Point>),
-    /// Texts next to points: above a positive y, below a negative one. A text that would touch the one before is left
+    /// Texts next to points: above a positive y, below a negative y. A text that would touch the previous text is left
     /// out.
     Labels(Vec<Point>),
     /// Threshold: a horizontal line at this y.
@@ -40,7 +39,7 @@ pub enum Shape {
     Moments(Vec<Point>),
 }
 
-/// One layer of a chart; later layers are drawn above earlier ones.
+/// One layer of a chart. Later layers are drawn above earlier layers.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Layer {
     /// Label in the legend; empty = not in the legend.
@@ -76,7 +75,6 @@ pub struct Chart {
     pub layers: Vec<Layer>,
 }
 
-/// The drawing area: its position and the ranges it shows.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Area {
     pub(super) left: f64,
@@ -88,21 +86,19 @@ pub(super) struct Area {
 }
 
 impl Area {
-    /// Converts x to pixels from the left edge of the area.
     pub(super) fn px(&self, x: f64) -> f64 {
         self.width * (x - self.x.0) / (self.x.1 - self.x.0)
     }
 
-    /// Converts y to pixels from the upper edge of the area.
     fn py(&self, y: f64) -> f64 {
         self.height * (self.y.1 - y) / (self.y.1 - self.y.0)
     }
 
-    /// Returns as many ticks as their labels leave room for.
+    /// Returns as many ticks as have room for their labels.
     fn x_ticks(&self, axis: &Axis) -> Vec<(f64, String)> {
         let fits = |ticks: &[(f64, String)]| {
             let widest = ticks.iter().map(|(_, word)| text_width(word, SMALL)).fold(0.0, f64::max);
-            // Distance between two labels, pixels: at least 16.
+            // Labels are at least 16 pixels apart.
             ticks.windows(2).all(|pair| self.px(pair[1].0) - self.px(pair[0].0) >= widest + 16.0)
         };
         let counts = (1..=10).rev().map(f64::from);
@@ -110,7 +106,6 @@ impl Area {
         choices.find(|ticks| fits(ticks)).unwrap_or_default()
     }
 
-    /// Draws the x axis: grid lines, ticks and label.
     pub(super) fn draw_x(&self, svg: &mut Svg, axis: &Axis) {
         let bottom = self.top + self.height;
         for (x, word) in self.x_ticks(axis) {
@@ -129,7 +124,7 @@ impl Chart {
         Self { title: title.into(), description: String::new(), x: x.into(), y: y.into(), layers }
     }
 
-    /// Returns the elements and their height in pixels.
+    /// Returns the elements and their height (pixels).
     pub(super) fn draw(&self, size: Size) -> (String, f64) {
         let mut svg = Svg::default();
         let mut top = title(&mut svg, &self.title, size.width);
@@ -139,7 +134,7 @@ impl Chart {
         let height = size.height - 60.0 - FOOT;
         let y_ticks = self.y.ticks(y, height / 28.0);
         let left = y_ticks.iter().map(|(_, word)| text_width(word, SMALL)).fold(16.0, f64::max) + 8.0;
-        // The margin at the right, pixels, has room for half of the last tick label.
+        // The right margin has room for half of the last tick label.
         let area = Area { left, top, width: size.width - left - 22.0, height, x, y };
         for (y, word) in y_ticks {
             let at = top + area.py(y);
@@ -153,7 +148,7 @@ impl Chart {
         (svg.0, top + height + FOOT)
     }
 
-    /// Draws the label of the y axis and the legend in rows; returns their lower edge.
+    /// Draws the label of the y axis and the legend in rows. Returns their lower edge.
     fn legend(&self, svg: &mut Svg, width: f64, top: f64) -> f64 {
         svg.text(0.0, top + 12.0, "t", &self.y.label);
         let (mut x, mut y) = (text_width(&self.y.label, SMALL) + 18.0, top);
@@ -170,7 +165,7 @@ impl Chart {
     }
 }
 
-/// Draws the title in as many lines as it needs; returns their lower edge.
+/// Draws the title in as many lines as it needs. Returns their lower edge.
 pub(super) fn title(svg: &mut Svg, text: &str, width: f64) -> f64 {
     let mut y = 0.0;
     for line in wrapped(text, width, 14.5) {
@@ -180,7 +175,6 @@ pub(super) fn title(svg: &mut Svg, text: &str, width: f64) -> f64 {
     if y > 0.0 { y + 6.0 } else { 0.0 }
 }
 
-/// Splits a text into lines of at most this width.
 pub(super) fn wrapped(text: &str, width: f64, size: f64) -> Vec<String> {
     let mut lines: Vec<String> = Vec::new();
     for word in text.split_whitespace() {
@@ -264,10 +258,10 @@ impl Layer {
 
     fn draw_points(&self, svg: &mut Svg, area: &Area, points: &[Point]) {
         let finite = || points.iter().filter(|point| point.x.is_finite() && point.y.is_finite());
-        // Maximum number of points with tool tips. In larger layers (points) have no tool tips.
+        // If a layer has more than 400 points, they have no tool tips.
         if finite().count() <= 400 {
             return finite().for_each(|point| {
-                // A point at the edge of the area is moved inwards; otherwise half of the dot would be cut off.
+                // A point at the edge of the area is moved inwards, because the area would cut off half of the dot.
                 let x = area.px(point.x);
                 let x = if (-0.5..=area.width + 0.5).contains(&x) { x.clamp(DOT, area.width - DOT) } else { x };
                 svg.circle((x, area.py(point.y)), DOT, &self.ink.fill(), &point.tip);
@@ -289,7 +283,7 @@ fn draw_labels(svg: &mut Svg, area: &Area, points: &[Point]) {
         if x - half < free {
             continue;
         }
-        // Distance between two texts, pixels.
+        // Texts are at least 4 pixels apart.
         free = x + half + 4.0;
         let y = area.py(point.y) + if point.y < 0.0 { 13.0 } else { -5.0 };
         svg.text(x, y.min(area.height - 3.0).max(11.0), "t m", &point.tip);
@@ -365,7 +359,7 @@ mod tests {
         let layers = (0..6).map(|i| Layer::new(&format!("a rather long label {i}"), Ink::Blue, Shape::Level(1.0)));
         let chart = chart(layers.collect());
         let more = chart.draw(Size::NARROW).1 - chart.draw(Size { width: 2000.0, ..Size::NARROW }).1;
-        // One label next to the name of the axis, then two labels per row.
+        // One label fits next to the name of the axis, then two labels per row.
         assert!((more - 3.0 * ROW).abs() < 0.1, "{more} pixels");
     }
 }

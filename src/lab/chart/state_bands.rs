@@ -6,11 +6,9 @@ use super::plot::{Area, title};
 use super::style::Ink;
 use super::svg::{Svg, text_width};
 
-/// Height of a band's name, pixels.
 const NAME: f64 = 16.0;
-/// Height of a band's spans, pixels.
 const BAR: f64 = 12.0;
-/// Minimum width of a span, pixels, so that even the shortest alarm is visible.
+/// Minimum width of a span (pixels). It keeps the shortest alarm visible.
 const LEAST: f64 = 3.0;
 
 /// A state with its start and end.
@@ -42,7 +40,7 @@ pub struct StateBands {
 }
 
 impl StateBands {
-    /// Returns the elements and their height in pixels.
+    /// Returns the elements and their height (pixels).
     pub(super) fn draw(&self, size: Size) -> (String, f64) {
         let mut svg = Svg::default();
         let mut top = title(&mut svg, &self.title, size.width);

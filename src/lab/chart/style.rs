@@ -1,22 +1,22 @@
 //! Defines the colours: CSS classes for strokes, fills and text, and their values on a light and a dark page.
 //!
-//! The inks follow the colours of Okabe and Ito, which people with any colour vision can distinguish. The inks are
-//! lighter on a dark page.
+//! The colours follow Okabe and Ito, so that people with any colour vision can distinguish them. They are lighter on a
+//! dark page.
 
 use std::fmt::Write as _;
 
 /// Colour of a drawn element.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Ink {
-    /// Colour of text; used for true values and for measurements.
+    /// Colour of text, true values and measurements.
     Plain,
     Blue,
     Orange,
     Green,
     Purple,
-    /// Used for thresholds and for the most severe alarms.
+    /// Colour of thresholds and of the most severe alarms.
     Red,
-    /// Used for warnings.
+    /// Colour of warnings.
     Amber,
     Grey,
 }
@@ -62,7 +62,7 @@ impl Ink {
     }
 }
 
-/// Returns the colours as variables of a page or a file. The dark values apply if the viewer prefers a dark background.
+/// Returns the colours as CSS variables. The dark values apply if the viewer prefers a dark background.
 pub fn variables() -> String {
     let list = |pick: fn(&(&str, &'static str, &'static str)) -> &'static str| {
         COLOURS.iter().fold(String::new(), |text, colour| text + &format!("--{}:{};", colour.0, pick(colour)))
@@ -74,7 +74,7 @@ pub fn variables() -> String {
     ) + &classes()
 }
 
-/// Returns a declaration of a colour. The light value comes first, for viewers without CSS variables (librsvg).
+/// Returns the declaration of a colour. The light value comes first, for viewers without CSS variables (librsvg).
 fn colour(property: &str, name: &str) -> String {
     let light = COLOURS.iter().find(|colour| colour.0 == name).map_or("", |colour| colour.1);
     format!("{property}:{light};{property}:var(--{name})")

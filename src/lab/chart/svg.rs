@@ -1,4 +1,4 @@
-//! Writes SVG elements as text. Their coordinates have few digits.
+//! Writes SVG elements as text, with few digits per coordinate.
 
 use std::fmt::Write as _;
 
@@ -19,16 +19,15 @@ pub fn escape(text: &str) -> String {
     out
 }
 
-/// Returns the approximate width of a text in a font of this size, pixels.
+/// Returns the approximate width of a text in a font of this size (pixels).
 pub(super) fn text_width(text: &str, size: f64) -> f64 {
-    // Average width of a character, as a share of the font size.
+    // A character is on average 0.56 times as wide as the font size.
     text.chars().count() as f64 * size * 0.56
 }
 
-/// Formats a coordinate with at most one decimal.
 pub(super) fn short(value: f64) -> String {
     let tenths = (value * 10.0).round();
-    // This limit is larger than any picture and keeps the text short for any input.
+    // The limit is larger than any picture and keeps the text short.
     let tenths = tenths.clamp(-1e6, 1e6) as i64;
     match (tenths / 10, tenths.abs() % 10) {
         (whole, 0) => whole.to_string(),
@@ -67,7 +66,7 @@ impl Svg {
         self.close("path", tip);
     }
 
-    /// Opens an area that clips its content. The origin of the content is the upper left corner of the area.
+    /// Opens an area that clips its content. The content's origin is the upper left corner of the area.
     pub(super) fn open_area(&mut self, (x, y): (f64, f64), (width, height): (f64, f64)) {
         let (x, y, width, height) = (short(x), short(y), short(width), short(height));
         self.push(format_args!(
@@ -118,7 +117,7 @@ impl PathBuilder {
         self.last = Some(rounded);
     }
 
-    /// A dot, drawn by a stroke with round ends.
+    /// Adds a dot, drawn by a stroke with round ends.
     pub(super) fn dot(&mut self, x: f64, y: f64) {
         self.pair('M', (x, y));
         self.d.push_str("h0");

@@ -37,12 +37,12 @@ pub(super) fn band(points: &[(f64, f64, f64)], bins: usize) -> Vec<(f64, f64, f6
     kept
 }
 
-/// Returns the function that gives the bin of an x. The x values of the series must not decrease.
+/// Returns the function that maps x to its bin. The x values of the series must not decrease.
 fn binning(mut xs: impl DoubleEndedIterator<Item = f64>, bins: usize) -> impl Fn(f64) -> f64 {
     let first = xs.next().unwrap_or(0.0);
     let last = xs.next_back().unwrap_or(first);
     let width = ((last - first) / bins.max(1) as f64).max(f64::MIN_POSITIVE);
-    // The last point belongs to the last bin and does not open another one.
+    // The last point belongs to the last bin.
     move |x| ((x - first) / width).floor().min(bins.max(1) as f64 - 1.0)
 }
 

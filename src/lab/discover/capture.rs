@@ -1,9 +1,9 @@
 //! Stores the frames and diagnostic answers of a log within a memory limit.
 //!
 //! All frames are kept until they exceed [`MAX_BYTES`]. Then whole windows of [`WINDOW_S`] are dropped: first every
-//! second window, then three of four, and so on. All identifiers keep the same windows, so the pages of multiplexed
-//! messages stay complete. Answers are reassembled from all frames of the kept identifiers, also from frames in dropped
-//! windows. If the answers of one kind exceed [`MAX_ANSWER_BYTES`], every second one of them is dropped.
+//! second window, then three of four, and so on. All identifiers keep the same windows, so that the pages of
+//! multiplexed messages stay complete. Answers are reassembled from all frames, including those in dropped windows. If
+//! the answers of one kind exceed [`MAX_ANSWER_BYTES`], every second answer is dropped.
 
 use std::collections::BTreeMap;
 
@@ -15,30 +15,26 @@ use crate::quantity::{BusIndex, Timestamp};
 const MAX_BYTES: usize = 48 << 20;
 /// Maximum number of bytes kept per kind of answer: about 800 answers of 64 bytes.
 const MAX_ANSWER_BYTES: usize = 64 << 10;
-/// Length of a window (s). A window is long compared with the period of a multiplexer page, and short compared with a
-/// drive.
+/// Length of a window (s): long compared with the period of a multiplexer page, and short compared with a drive.
 const WINDOW_S: f64 = 2.0;
-/// Maximum number of messages (identifiers on an interface) that are kept. A car has a few hundred messages; a flood of
-/// random identifiers has more.
+/// Maximum number of kept messages (identifiers on an interface). A car has a few hundred; a flood of random
+/// identifiers has more.
 const MAX_MESSAGES: usize = 4096;
-/// First data byte of answers from BMW controllers. This byte shows that addressing is extended, even if no
+/// First data byte of answers from BMW controllers. It shows that addressing is extended, even if no
 /// `[[input.diagnostic]]` describes the controller.
 const TESTER: u8 = 0xF1;
 
-/// An identifier on an interface.
 pub(super) type MessageKey = (BusIndex, CanId);
 
-/// Payloads of one message, with their times.
 #[derive(Debug, Default)]
 pub(super) struct Payloads {
     /// Times since the first frame of the log (s).
     times: Vec<f64>,
     data: Vec<u8>,
-    /// End of each payload in `data`.
     ends: Vec<usize>,
 }
 
-/// Kind of answer: its sender, its service, and the identifier of the values in it.
+/// Kind of answer: sender, service, and identifier of the values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct AnswerKey {
     pub(super) bus: BusIndex,
@@ -48,10 +44,9 @@ pub(super) struct AnswerKey {
     pub(super) identifier: u16,
 }
 
-/// A request: time (s); CAN identifier; and the first data byte if addressing is extended.
+/// A request: time (s), CAN identifier, and the first data byte if addressing is extended.
 type HeardRequest = (f64, CanId, Option<u8>);
 
-/// Answers of one kind.
 #[derive(Debug, Default)]
 pub(super) struct Answers {
     /// CAN identifier of the requests, and their first data byte if addressing is extended; `None` = no request was
@@ -59,38 +54,33 @@ pub(super) struct Answers {
     pub(super) request: Option<(CanId, Option<u8>)>,
     /// Data of the answers after the echoed service and identifier.
     pub(super) payloads: Payloads,
-    /// Number of answers seen.
     pub(super) seen: u64,
     stride: u64,
 }
 
-/// The capture of one log.
 #[derive(Debug, Default)]
 pub(super) struct Capture {
     pub(super) messages: BTreeMap<MessageKey, Payloads>,
     pub(super) answers: BTreeMap<AnswerKey, Answers>,
     /// Number of frames received, without remote frames.
     pub(super) frames: u64,
-    /// Number of frames that were ignored because [`MAX_MESSAGES`] was exceeded.
     pub(super) ignored: u64,
     receivers: BTreeMap<(MessageKey, Option<u8>), Receiver>,
     requests: BTreeMap<(BusIndex, u8, u16), HeardRequest>,
     start: Option<Timestamp>,
     latest_s: f64,
     bytes: usize,
-    /// One of every `mask` + 1 windows is kept. Values are 0, 1, 3, 7, ...
+    /// One of `mask` + 1 windows is kept. Values are 0, 1, 3, 7, ...
     mask: u64,
 }
 
 impl Payloads {
-    /// Iterates over times and payloads.
     pub(super) fn iter(&self) -> impl Iterator<Item = (f64, &[u8])> {
         let starts = std::iter::once(0).chain(self.ends.iter().copied());
         let ranges = starts.zip(&self.ends).map(|(start, end)| &self.data[start..*end]);
         self.times.iter().copied().zip(ranges)
     }
 
-    /// Returns the number of payloads.
     pub(super) fn len(&self) -> usize {
         self.times.len()
     }
@@ -101,7 +91,6 @@ impl Payloads {
         self.ends.push(self.data.len());
     }
 
-    /// Keeps only the payloads whose index and time satisfy `is_kept`.
     fn retain(&mut self, mut is_kept: impl FnMut(usize, f64) -> bool) {
         let mut kept = Self::default();
         for (index, (time_s, payload)) in self.iter().enumerate() {
@@ -118,13 +107,12 @@ impl Payloads {
 }
 
 impl Capture {
-    /// Receives a frame.
     pub(super) fn handle(&mut self, time: Timestamp, bus: BusIndex, frame: &Frame) {
         if frame.kind() == FrameKind::Remote {
             return;
         }
         let start = *self.start.get_or_insert(time);
-        // Seconds since the start of the log; exact to a microsecond, even over centuries.
+        // Seconds since the start of the log, exact to a microsecond even over centuries.
         let time_s = time.nanos().saturating_sub(start.nanos()) as f64 * 1e-9;
         self.latest_s = self.latest_s.max(time_s);
         self.frames += 1;
@@ -143,7 +131,6 @@ impl Capture {
         self.receive(time, time_s, key, frame.data());
     }
 
-    /// Returns the length of the log (s).
     pub(super) fn seconds(&self) -> f64 {
         self.latest_s
     }
@@ -156,8 +143,8 @@ impl Capture {
     }
 
     fn receive(&mut self, time: Timestamp, time_s: f64, key: MessageKey, data: &[u8]) {
-        // BMW testers send requests from 6F1 with the target in the first byte; in the answer, the first byte names the
-        // tester.
+        // A BMW tester sends requests from 6F1, with the target in the first byte. The first byte of an answer names
+        // the tester.
         let is_extended = |byte: &u8| *byte == TESTER || key.1 == CanId::Standard(0x600 | u16::from(TESTER));
         let extensions = [None, data.first().copied().filter(is_extended)];
         for (index, extension) in extensions.into_iter().enumerate() {
@@ -194,10 +181,10 @@ impl Capture {
         let service = first.wrapping_sub(0x40);
         let Some((number, length)) = identifier(service) else { return };
         let request = self.requests.get(&(bus, service, number));
-        // Largest P2* of ISO 14229-2 (time until an answer) (s).
+        // The largest P2* of ISO 14229-2 (time until an answer) is 5 s.
         let request = request.filter(|(at, _, _)| time_s - at <= 5.0).map(|(_, id, first)| (*id, *first));
         let key = AnswerKey { bus, response: id, extension, service, identifier: number };
-        // If no request was received, a single frame may be any message that starts with the same bytes.
+        // Without a request, a single frame may be any message that starts with the same bytes.
         let is_known = self.answers.contains_key(&key) || is_long || request.is_some();
         if is_known && (self.answers.contains_key(&key) || self.answers.len() < 1024) {
             self.answers.entry(key).or_default().push(time_s, request, &rest[length..]);
@@ -220,7 +207,7 @@ impl Answers {
     }
 }
 
-/// Returns the number of the window that contains a time. Negative times (before the first stamp) belong to window 0.
+/// Returns the number of a time's window. Times before the first stamp belong to window 0.
 fn window(time_s: f64) -> u64 {
     (time_s / WINDOW_S) as u64
 }

@@ -1,8 +1,8 @@
 //! Writes the best candidates as a configuration, or returns the questions that prevent it.
 //!
-//! Everything that the log determines is written. The configuration lists what remains to be decided: the cell model,
+//! The configuration contains everything that the log determines, and lists the remaining decisions: the cell model,
 //! the assignment of sensors to cells, limits and alarms. The sign of the current and the number of cells are never
-//! guessed. Without evidence, both become questions.
+//! guessed. Without evidence, they become questions.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
@@ -18,7 +18,7 @@ use crate::fit::quoted;
 use crate::import::{DiagnosticSignal, DiagnosticTable, series};
 use crate::wiring::evidence::{HIDDEN_SOC, PackQuantity};
 
-/// Why a signal is missing, and the next step.
+/// Statement for a missing signal, with the next step.
 const NO_CANDIDATE: &str =
     "no signal in the log looks like it: give the DBC file that describes it with --dbc, or a log of a drive";
 
@@ -29,7 +29,7 @@ pub struct PackSettings {
     pub source: String,
     /// Paths of the DBC files as the configuration names them, in the order in which the files were added.
     pub databases: Vec<String>,
-    /// Path of the new DBC as the configuration names it. The new DBC describes the fields that no given DBC describes.
+    /// Path of the new DBC as the configuration names it. It describes the fields that no given DBC describes.
     pub own_database: String,
     /// Path of the cell model as the configuration names it; `None` if the label describes the cell.
     pub cell_model: Option<String>,
@@ -42,14 +42,13 @@ pub struct PackSettings {
 pub struct PackConfiguration {
     /// TOML.
     pub text: String,
-    /// DBC of the fields that no given DBC describes. The DBC must be saved as the file that
-    /// [`PackSettings::own_database`] names.
+    /// DBC of the fields that no given DBC describes. It must be saved under the path in
+    /// [`PackSettings::own_database`].
     pub database: Option<String>,
-    /// Questions that the log does not answer and the user must decide.
+    /// Questions that the user must decide because the log does not answer them.
     pub open: Vec<String>,
 }
 
-/// The signals of the configuration.
 struct Selection<'a> {
     current: &'a Candidate,
     positive: PositiveDirection,
@@ -59,7 +58,6 @@ struct Selection<'a> {
     reported: Vec<(&'static str, &'a Candidate)>,
 }
 
-/// Writer of the configuration's text, with its inputs.
 pub(super) struct Writer<'a> {
     pub(super) discovery: &'a Discovery,
     pub(super) capture: &'a Capture,
@@ -68,7 +66,6 @@ pub(super) struct Writer<'a> {
 }
 
 impl Writer<'_> {
-    /// Writes the configuration, or returns the questions that prevent it.
     pub(super) fn write(&self) -> Result<PackConfiguration, Vec<String>> {
         let selection = self.select()?;
         let mut open = Vec::new();
@@ -101,7 +98,6 @@ impl Writer<'_> {
         Ok(PackConfiguration { text, database, open })
     }
 
-    /// Returns the used fields whose message no DBC describes.
     fn fields(&self, selection: &Selection<'_>) -> Vec<&MessageField> {
         let members = self.candidates(selection).into_iter().flat_map(|candidate| &candidate.members);
         let found = members.filter_map(|index| match &self.signal(*index).origin {
@@ -159,7 +155,7 @@ impl Writer<'_> {
         else {
             return Err(questions);
         };
-        // A field without a name may be a temperature or something else.
+        // An unnamed field may be another quantity than a temperature.
         let temperature = self.best(PackQuantity::Temperature).filter(|candidate| !self.is_raw(candidate));
         let soc = self.best(PackQuantity::Soc).map(|candidate| ("reported_soc", candidate));
         let soh = self.best(PackQuantity::Soh).map(|candidate| ("reported_soh", candidate));
@@ -167,7 +163,8 @@ impl Writer<'_> {
         Ok(Selection { current, positive, voltage, cells, temperature, reported })
     }
 
-    /// The numbers of cells in series with which a pack voltage is plausible. A state of charge narrows the range.
+    /// Returns the lowest and highest number of cells in series that make a pack voltage plausible. A known state of
+    /// charge narrows the range.
     fn fitting_cells(&self, pack: &Candidate) -> (u32, u32) {
         let label = &self.descriptions.label;
         let (mut low_v, mut high_v) = (3.0, 4.2);
@@ -177,7 +174,7 @@ impl Writer<'_> {
             (low_v, high_v) = (model.voltage_min_v, model.voltage_max_v);
             if let Some(soc) = self.best(PackQuantity::Soc) {
                 let ocv_v = |soc: f64| model.ocv_v(&model.grid_position(soc.clamp(0.0, 1.0), 25.0));
-                // Under load, the voltage differs from the open-circuit voltage.
+                // The margins are needed under load, where the voltage differs from the open-circuit voltage.
                 (low_v, high_v) =
                     (ocv_v(soc.low / 100.0 - HIDDEN_SOC) - 0.05, ocv_v(soc.high / 100.0 + HIDDEN_SOC) + 0.05);
             }
@@ -195,8 +192,7 @@ impl Writer<'_> {
         candidate.members.iter().any(is_raw)
     }
 
-    /// Returns the number of cells of a group; `None` if the cell numbers have gaps or the group has fewer than two
-    /// cells.
+    /// Returns the number of cells of a group; `None` if the numbers have gaps or there are fewer than two cells.
     fn row(&self, group: &Candidate) -> Option<u16> {
         let numbers = self.numbers(group)?;
         let first = *numbers.first()?;
@@ -204,7 +200,6 @@ impl Writer<'_> {
         u16::try_from(numbers.len()).ok().filter(|count| *count >= 2 && has_no_gap)
     }
 
-    /// Returns the cell numbers of a group, ascending.
     fn numbers(&self, group: &Candidate) -> Option<Vec<u32>> {
         let before = group.signal.split_once("{n}").filter(|(before, _)| !before.contains("{m}"));
         let mut numbers = Vec::new();
@@ -212,7 +207,7 @@ impl Writer<'_> {
             let name = &self.signal(*index).name;
             let rest = match before {
                 Some((before, _)) => name.strip_prefix(before)?,
-                // If a name has several numbers, the last one counts the cells.
+                // If a name has several numbers, the last one is the cell number.
                 None => name.rsplit(|c: char| !c.is_ascii_digit()).find(|text| !text.is_empty())?,
             };
             let digits = rest.bytes().take_while(u8::is_ascii_digit).count();
@@ -304,7 +299,7 @@ impl Writer<'_> {
         let _ = write!(text, "\n# {}\n{table}\nsignal = {}\n", plain(&candidate.reasons.join("; ")), quoted(signal));
         let _ = write!(text, "interface = {}\n{more}", quoted(&candidate.interface));
         let (mut scale, offset) = self.signal(candidate.members[0]).conversion;
-        // A configured scale replaces that of a percentage.
+        // A scale in the configuration replaces the factor 0.01 for percent.
         if scale != 1.0 && matches!(candidate.quantity, PackQuantity::Soc | PackQuantity::Soh) {
             scale *= 0.01;
         }
@@ -327,8 +322,8 @@ impl Writer<'_> {
         }
     }
 
-    /// Returns the given definitions, reduced to the signals in use; and, per kind of answer, the fields in use that no
-    /// definition describes.
+    /// Returns the given definitions, reduced to the selected signals, and for each kind of answer the selected fields
+    /// that no definition describes.
     fn used_tables(
         &self,
         selection: &Selection<'_>,
@@ -400,8 +395,8 @@ impl Writer<'_> {
         }
     }
 
-    /// Writes the maximum ages of readings. These ages follow from the periods in the log, because diagnostic answers
-    /// may be many seconds apart.
+    /// Writes the maximum ages of readings. They follow from the periods in the log, because diagnostic answers may be
+    /// many seconds apart.
     fn limits(&self, selection: &Selection<'_>, text: &mut String) {
         let named = [
             ("current", Some(selection.current)),
@@ -415,7 +410,7 @@ impl Writer<'_> {
                 .iter()
                 .map(|index| self.signal(*index).series.period_s().unwrap_or(0.0))
                 .fold(0.0, f64::max);
-            // At least 2 s, which is the default for voltages.
+            // The default for voltages is 2 s.
             let age_s = (3.0 * period_s).max(2.0).ceil();
             let _ = write!(text, "\n[limits.{name}]\nmax_age_s = {age_s:.1}\n");
         }

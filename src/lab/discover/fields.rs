@@ -2,11 +2,10 @@
 //!
 //! * Voltage: fields of 16 bits at every byte and of 12 bits at every half byte, in both byte orders, with common
 //!   scales. The value is plausible for a pack, varies by at most 35 % and takes at least five different codes.
-//! * Current: the same positions, but signed. The changes of the field correlate with the changes of a voltage, as with
-//!   a current through a resistance. The scale is a guess: of the common scales, the one whose resistance is closest to
-//!   a typical resistance of the label's pack. A current that never comes near zero has an offset.
-//! * Cells: neighbouring fields of 8, 12 or 16 bits with similar values. Each message or page (selected by the first
-//!   byte) has at least three such fields, and all messages together have at least eight.
+//! * Current: the same positions, but signed. The changes of the field correlate with the changes of a voltage, because
+//!   the pack has a resistance. The scale is a guess: the common scale whose resistance is closest to the typical
+//!   resistance of the label's pack.
+//! * Cells: neighbouring fields of 8, 12 or 16 bits with similar values.
 //!
 //! Temperatures and SOC are not searched for, because they show no characteristic behaviour within minutes.
 
@@ -23,18 +22,18 @@ use crate::wiring::evidence::{Series, Slope, windows};
 
 /// Maximum number of payloads that are evaluated per message, or per page of a message.
 const MAX_PAYLOADS: usize = 1500;
-/// Plausible voltages of a pack (V). The scales below are in V per code.
 const PACK_V: (f64, f64) = (100.0, 950.0);
+/// Scales of a pack voltage (V per code).
 const PACK_SCALES: [f64; 5] = [0.1, 0.01, 0.05, 0.25, 0.5];
 /// Largest deviation of the pack's voltage from the sum of its cells, as a fraction.
 const SUM_TOLERANCE: f64 = 0.02;
-/// Scales of a current (A) per code.
+/// Scales of a current (A per code).
 const CURRENT_SCALES: [f64; 7] = [0.1, 0.01, 0.05, 0.025, 0.25, 0.5, 1.0];
-/// Fewest cells of a row, if the label does not state the number of cells.
+/// Fewest cells, if the label does not state their number.
 const MIN_CELLS: usize = 8;
 /// Largest difference between cells of a pack (V).
 const MAX_SPREAD_V: f64 = 0.25;
-/// Lengths of a cell voltage in bits, each with the scales to try (V) per code.
+/// Lengths of a cell voltage in bits, each with the scales to try (V per code).
 const CELL_FORMS: [(u16, &[f64]); 3] = [(16, &[0.001, 0.0001, 0.002, 0.0005]), (12, &[0.001, 0.002]), (8, &[0.02])];
 
 /// Returns the name of a message that no DBC describes. The identifier is decimal, so that its digits form one number.
@@ -42,7 +41,6 @@ pub(super) fn message_name(id: CanId) -> String {
     format!("Message{}", id.raw())
 }
 
-/// Returns the fields that behave like a voltage, a current or cells.
 pub(super) fn signals(capture: &Capture, label: &PackLabel) -> Vec<LogSignal> {
     let diagnostic: BTreeSet<CanId> = capture
         .answers
@@ -73,12 +71,11 @@ pub(super) fn signals(capture: &Capture, label: &PackLabel) -> Vec<LogSignal> {
     found
 }
 
-/// Payloads of a message, limited to what the evaluation needs.
 struct Samples<'a> {
     key: MessageKey,
     /// Length of the shortest payload, at most 8 bytes.
     bytes: usize,
-    /// Values of the first byte if this byte numbers pages; otherwise a single `None`.
+    /// Values of the first byte if it numbers pages; otherwise a single `None`.
     pages: Vec<Option<u8>>,
     payloads: Vec<(f64, &'a [u8])>,
 }
@@ -88,10 +85,11 @@ impl<'a> Samples<'a> {
         let bytes = payloads.iter().map(|(_, data)| data.len()).min().unwrap_or(0).min(8);
         let pages = pages(payloads);
         let payloads = if pages.len() > 1 {
-            // Taking every n-th payload might drop whole pages.
+            // The first payloads are taken, because taking every n-th payload might drop whole pages.
             payloads.iter().take(MAX_PAYLOADS * pages.len()).collect()
         } else {
-            // The steps from payload to payload show a current. Over longer times, the charge changes the voltage too.
+            // Short runs of successive payloads are taken, because over longer times, the charge changes the voltage
+            // too.
             windows(payloads.iter().collect(), MAX_PAYLOADS, 8.0)
         };
         Self { key, bytes, pages, payloads }
@@ -124,8 +122,8 @@ fn layouts(bytes: usize, signed: bool) -> Vec<SignalLayout> {
     found
 }
 
-/// Returns the layout of a field whose first bit is `first`. The bytes follow the wire. Within a byte, bits are counted
-/// from the lowest bit for little-endian fields, from the highest bit for big-endian fields.
+/// Returns the layout of a field whose first bit is `first`. Bytes are counted as transmitted. Bits in a byte are
+/// counted from the lowest bit (little-endian) or from the highest bit (big-endian).
 fn layout(first: u16, bits: u16, byte_order: ByteOrder, value_type: ValueType, factor: f64) -> SignalLayout {
     let start_bit = match byte_order {
         ByteOrder::LittleEndian => first,
@@ -166,19 +164,18 @@ fn signal(
     LogSignal::unnamed(full_name, key.0, origin, quantity, series)
 }
 
-/// Returns the part of a field's name that states its length, start bit and byte order.
 fn place(layout: &SignalLayout) -> String {
     let order = if layout.byte_order == ByteOrder::LittleEndian { "little" } else { "big" };
     format!("{}bits_at_{}_{order}", layout.length_bits, layout.start_bit)
 }
 
-/// Finds the fields that may be the pack's voltage. `sum_v`: the sum of the cell voltages found (V); 0 = no cells.
+/// Finds the fields that may be the pack's voltage. `sum_v` is the sum of the found cell voltages (V); 0 = no cells.
 fn voltages_of(samples: &Samples<'_>, label: &PackLabel, sum_v: f64) -> Vec<LogSignal> {
     let mut found = Vec::new();
     let (low_v, high_v) = label.pack_v().unwrap_or(PACK_V);
     for layout in layouts(samples.bytes, false) {
         let codes = samples.values(&layout, None);
-        // Within a log, the voltage of a pack varies by at most this share of its maximum.
+        // The voltage of a pack varies by at most 35 % of its maximum within a log.
         let is_alive = codes.bad() == 0 && codes.distinct() >= 5 && swing(&codes) <= 0.35;
         if !is_alive || codes.is_counter() {
             continue;
@@ -213,12 +210,12 @@ fn currents<'a>(
         let all = layouts(samples.bytes, true).into_iter().chain(layouts(samples.bytes, false));
         let read = all.map(|layout| (layout, samples.values(&layout, None)));
         let read: Vec<_> = read.filter(|(_, codes)| !codes.is_constant() && !codes.is_counter()).collect();
-        // The lowest and the highest cell, for example.
+        // For example, fields with the lowest and the highest cell voltage repeat a voltage.
         let repeats = |codes: &Series| voltages.iter().any(|voltage| is_reading_of(codes, &voltage.series));
         let taken: Vec<SignalLayout> =
             read.iter().filter(|(_, codes)| repeats(codes)).map(|(layout, _)| *layout).collect();
         for (layout, codes) in read {
-            // Without the highest bit, the unsigned field equals the signed field.
+            // If the highest bit is never set, the unsigned field equals the signed field.
             let is_same =
                 layout.value_type == ValueType::Unsigned && codes.extent.max < f64::from(layout.length_bits - 1).exp2();
             if is_same || taken.iter().any(|taken| taken.overlaps(&layout)) {
@@ -235,7 +232,7 @@ fn currents<'a>(
             let Some((slope, mean_v)) = best else { continue };
             let distance = |factor: &f64| {
                 let unusual = (slope.ohm.abs() / factor / mean_v / label.ohm_per_v()).ln().abs();
-                // The first scale is preferred, because it is the most common scale.
+                // The first scale is preferred because it is the most common.
                 if *factor == CURRENT_SCALES[0] { unusual - 0.25 } else { unusual }
             };
             let factor = CURRENT_SCALES.iter().copied().min_by(|a, b| distance(a).total_cmp(&distance(b)));
@@ -250,24 +247,22 @@ fn currents<'a>(
     found.into_iter().take(12).map(|(_, signal)| signal).collect()
 }
 
-/// Whether the codes are another reading of the voltage: the values are equal at a common scale, and change in
-/// proportion. The codes of a current with an offset may have the same values, but the resistance sets their changes.
+/// Whether the codes repeat the voltage: the values are equal at a common scale and change in proportion. A current
+/// with an offset may have equal values, but its changes do not match.
 fn is_reading_of(codes: &Series, voltage: &Series) -> bool {
     let scale = voltage.extent.mean() / codes.extent.mean();
     let common = PACK_SCALES.iter().chain(CELL_FORMS[0].1).any(|common| (scale / common - 1.0).abs() < 0.05);
-    // The slope is that of a resistance: negative if both rise.
+    // `Slope` counts a resistance as positive, so the slope is negative if codes and voltage rise together.
     let slope = Slope::between(voltage, codes).filter(|slope| slope.correlation() >= 0.5);
     common && slope.is_some_and(|slope| (0.5..2.0).contains(&(-slope.ohm / scale)))
 }
 
-/// Whether a field overlaps a layout in the message `id`, on any interface: gateways repeat messages on other
-/// interfaces.
+/// Whether a field overlaps a layout in the message `id` on any interface, because gateways repeat messages.
 fn shares_bits(field: &LogSignal, id: CanId, layout: &SignalLayout) -> bool {
     matches!(&field.origin, SignalOrigin::Field(own) if own.id == id && own.signal.layout.overlaps(layout))
 }
 
 impl LogSignal {
-    /// Returns the message of a field that no DBC describes.
     fn message(&self) -> Option<MessageKey> {
         match &self.origin {
             SignalOrigin::Field(field) => Some((self.bus, field.id)),
@@ -282,7 +277,7 @@ fn cells(messages: &[Samples<'_>], label: &PackLabel) -> Vec<LogSignal> {
     let mut best: Vec<LogSignal> = Vec::new();
     let wanted = label.cells.map(usize::from);
     let least = wanted.unwrap_or(MIN_CELLS).clamp(3, MIN_CELLS);
-    // The number on the label outweighs a longer row.
+    // A row with the label's number of cells is preferred to a longer row.
     let weight = |found: &Vec<LogSignal>| (Some(found.len()) == wanted, found.len());
     for (bits, scales) in CELL_FORMS {
         for factor in scales {
@@ -308,7 +303,7 @@ fn cells_of_form(
     for samples in messages {
         let end = u16::try_from(8 * samples.bytes).unwrap_or(0);
         for page in &samples.pages {
-            // Skip the page byte; a byte of flags may follow it.
+            // Skip the page byte and, in some rows, a byte of flags after it.
             let first = if page.is_some() { 8 } else { 0 };
             let starts = (first..first + 16).step_by(if bits == 12 { 4 } else { 8 });
             let rows = starts.map(|start| {
@@ -327,27 +322,26 @@ fn cells_of_form(
     found
 }
 
-/// Whether a row may belong to the same pack as the cells found so far.
 fn continues(cells: &[LogSignal], key: MessageKey, row: &[(SignalLayout, Series)]) -> bool {
     cells.first().is_none_or(|first| {
         first.bus == key.0 && (first.series.extent.mean() - row[0].1.extent.mean()).abs() <= MAX_SPREAD_V
     })
 }
 
-/// Returns the pages of a message: the values of the first byte if they are 2 to 64 consecutive numbers that repeat,
-/// otherwise a single `None` for the whole message.
+/// Returns the values of the first byte if they number pages: 2 to 64 consecutive numbers that repeat. Otherwise,
+/// returns a single `None`.
 fn pages(payloads: &Payloads) -> Vec<Option<u8>> {
     let values: BTreeSet<u8> = payloads.iter().filter_map(|(_, data)| data.first().copied()).collect();
     let span = values.first().zip(values.last()).map_or(0, |(first, last)| usize::from(last - first) + 1);
     let is_counter = (2..=64).contains(&values.len()) && span == values.len() && payloads.len() >= 3 * span;
-    // A page number changes from payload to payload; the high byte of a big-endian voltage seldom does.
+    // A page number changes from payload to payload. The high byte of a big-endian voltage seldom changes.
     let firsts: Vec<Option<&u8>> = payloads.iter().map(|(_, data)| data.first()).collect();
     let changes = firsts.windows(2).filter(|pair| pair[0] != pair[1]).count();
     let is_cycling = 2 * changes >= payloads.len();
     if is_counter && is_cycling { values.into_iter().map(Some).collect() } else { vec![None] }
 }
 
-/// Finds the longest run of plausible neighbouring fields with similar values.
+/// Returns the longest run of plausible neighbouring fields with similar values.
 fn row(
     samples: &Samples<'_>,
     page: Option<u8>,
@@ -362,12 +356,12 @@ fn row(
     let row = longest_run(neighbours, |(_, first), (_, next)| {
         (next.extent.mean() - first.extent.mean()).abs() <= MAX_SPREAD_V
     });
-    // Bytes that never change are more likely to be text or constants.
+    // Bytes that never change are probably text or constants.
     let is_alive = row.iter().any(|(_, series)| !series.is_constant());
     if is_alive { row } else { Vec::new() }
 }
 
-/// Writes a DBC of these fields. Pages become values of a multiplexor.
+/// Creates a DBC of these fields. Pages become values of a multiplexor.
 pub(super) fn database(fields: &[&MessageField]) -> Database {
     let mut messages: Vec<Message> = Vec::new();
     for field in fields {
@@ -385,7 +379,6 @@ pub(super) fn database(fields: &[&MessageField]) -> Database {
     Database { comment: Some(comment), messages, ..Database::default() }
 }
 
-/// Creates a message without fields. If the field lies on a page, the message gets a multiplexor.
 fn empty_message(field: &MessageField) -> Message {
     let layout = layout(0, 8, ByteOrder::LittleEndian, ValueType::Unsigned, 1.0);
     let page =

@@ -1,22 +1,20 @@
-//! Groups signals whose names are equal except for their numbers, for example cells or sensors.
+//! Groups signals whose names differ only in their numbers, for example cells or sensors.
 
 use std::collections::{BTreeMap, BTreeSet};
 
-/// Signals whose names differ only in numbers.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct SignalGroup {
-    /// Name with `{n}` in place of the number that counts the members, and `{m}` in place of other varying numbers.
+    /// Name with `{n}` in place of the member's number, and `{m}` in place of other varying numbers.
     pub(crate) pattern: String,
-    /// Number of each member, and the index of the member among all names.
+    /// Number of each member, and its index among all names.
     pub(crate) members: Vec<(u32, usize)>,
 }
 
-/// A name: its index among all names, and the numbers in it.
 type NumberedName<'a> = (usize, Vec<&'a str>);
 
-/// Returns the groups. Each item of `names` is a partition and a name. At least two names of one partition form a group
-/// if their texts between the numbers are equal. The number that varies most counts the members; if several vary
-/// equally, the last one does. If two members have the same number, they are not grouped.
+/// Returns the groups. Each item of `names` is a partition and a name. At least two names of a partition form a group
+/// if their texts between the numbers are equal. The number that varies most is the member's number; if several vary
+/// equally, the last of them is the member's number. If two members have the same number, they are not grouped.
 pub(crate) fn groups(names: &[(String, &str)]) -> Vec<SignalGroup> {
     let mut found: BTreeMap<(&str, Vec<&str>), Vec<NumberedName<'_>>> = BTreeMap::new();
     for (index, (partition, name)) in names.iter().enumerate() {
@@ -47,7 +45,7 @@ fn group(texts: &[&str], members: &[NumberedName<'_>]) -> Option<SignalGroup> {
     (numbered.len() == members.len()).then_some(SignalGroup { pattern, members: numbered })
 }
 
-/// Splits a name at its numbers. Returns the texts (one text more than numbers), and the numbers.
+/// Splits a name at its numbers. Returns texts and numbers; there is one more text than numbers.
 fn split_numbers(name: &str) -> (Vec<&str>, Vec<&str>) {
     let (mut texts, mut numbers, mut rest) = (Vec::new(), Vec::new(), name);
     while let Some(start) = rest.find(|c: char| c.is_ascii_digit()) {

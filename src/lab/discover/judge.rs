@@ -1,9 +1,10 @@
-//! Decides which signal carries which quantity. Points are given for names and units
-//! ([`SignalLabel`](crate::wiring::evidence::SignalLabel)), for ranges and for behaviour, each with a reason in words.
+//! Decides which signal carries which quantity. Names and units
+//! ([`SignalLabel`](crate::wiring::evidence::SignalLabel)), ranges and behaviour give points, each with a reason in
+//! words.
 //!
 //! The points are weights of evidence that were chosen on three cars. A value outside the range of a quantity excludes
-//! that quantity. A unit or a name gives 1 to 3 points. Behaviour that hardly any other signal shows gives up to 4
-//! points. Examples are a voltage that falls when the current rises, and a voltage that equals the sum of the cells.
+//! it. A unit or a name gives 1 to 3 points. Behaviour that hardly any other signal shows gives up to 4 points. For
+//! example, a pack voltage falls when the current rises, and equals the sum of the cells.
 
 use super::groups::{SignalGroup, groups};
 use super::label::PackLabel;
@@ -15,10 +16,8 @@ use crate::filter::ends;
 use crate::quantity::BusIndex;
 use crate::wiring::evidence::{PackQuantity, Score, Series, Slope};
 
-/// Evidence for one signal or group.
 #[derive(Debug, Clone)]
 pub(super) struct Evidence {
-    /// Indices of the signals.
     pub(super) members: Vec<usize>,
     name: String,
     bus: BusIndex,
@@ -26,17 +25,15 @@ pub(super) struct Evidence {
     low: f64,
     high: f64,
     positive: Option<PositiveDirection>,
-    /// Whether a pack voltage equals the sum of cells.
     is_sum: bool,
 }
 
 impl Evidence {
-    /// Creates the evidence from the label. Returns `None` if the label excludes the quantity, or if a value lies
-    /// outside the range (both ends belong to the range).
+    /// Returns `None` if the label excludes the quantity, or if a value lies outside the inclusive `range`.
     fn new(index: usize, signal: &LogSignal, quantity: PackQuantity, range: (f64, f64)) -> Option<Self> {
         let (low, high) = (signal.series.extent.min, signal.series.extent.max);
         let mut score = signal.label.score(quantity).filter(|_| low >= range.0 && high <= range.1)?;
-        // A field without a name was already selected by its values.
+        // The search selected an unnamed field by its values, so its label gives no points.
         if signal.is_unnamed() {
             score = Score::default();
         }
@@ -66,7 +63,6 @@ impl Evidence {
     }
 }
 
-/// Returns the candidates of every quantity, best first.
 pub(super) fn candidates(signals: &[LogSignal], interfaces: &[String], label: &PackLabel) -> Vec<Candidate> {
     let groups = groups(&signals.iter().map(|signal| (partition(signal), signal.name.as_str())).collect::<Vec<_>>());
     let usable: Vec<usize> = (0..signals.len()).filter(|index| signals[*index].is_mostly_valid()).collect();
@@ -101,9 +97,9 @@ pub(super) fn candidates(signals: &[LogSignal], interfaces: &[String], label: &P
     all.into_iter().flat_map(|(quantity, evidence)| ranked(quantity, evidence, interfaces)).collect()
 }
 
-/// Returns the partition of a signal: its interface and source. Only signals of one partition form groups. The fields
-/// of an answer without a definition have their own partition, because the numbers in the answer's name do not count
-/// them. Cells of such answers are numbered across the answers of a controller, so the controller is their partition.
+/// Returns the partition (interface and source) of a signal. Only signals of one partition form groups. Undefined
+/// fields of an answer have their own partition, because the numbers in the answer's name do not number the fields.
+/// Cells in such answers are numbered per controller, so the controller is their partition.
 fn partition(signal: &LogSignal) -> String {
     let source = match &signal.origin {
         SignalOrigin::Dbc(_) => String::new(),
@@ -123,7 +119,6 @@ fn sort(evidence: &mut [Evidence]) {
 
 fn ranked(quantity: PackQuantity, mut evidence: Vec<Evidence>, interfaces: &[String]) -> Vec<Candidate> {
     sort(&mut evidence);
-    // Each field appears once, with its best scale.
     let mut known = std::collections::BTreeSet::new();
     evidence.retain(|evidence| known.insert((evidence.bus, evidence.name.clone())));
     let good = evidence.into_iter().filter(|evidence| evidence.score.points >= 2.5).take(10);
@@ -154,7 +149,6 @@ fn voltage(index: usize, signal: &LogSignal, label: &PackLabel) -> Option<Eviden
     Some(evidence)
 }
 
-/// Adds the evidence that a field without a name is a pack voltage.
 fn raw_voltage(mut evidence: Evidence, signal: &LogSignal, range: Option<(f64, f64)>) -> Evidence {
     let (series, low, high) = (&signal.series, evidence.low, evidence.high);
     match range {
@@ -169,22 +163,21 @@ fn raw_voltage(mut evidence: Evidence, signal: &LogSignal, range: Option<(f64, f
     evidence
 }
 
-/// Adds the evidence that a field without a name is a pack current.
 fn raw_current(mut evidence: Evidence, signal: &LogSignal) -> Evidence {
     let Some(field) = signal.field() else {
-        // A field of a message was selected because it changes with a voltage.
+        // The search selected a field of a message because it changes with a voltage.
         evidence.add(1.0, true, "its scale is a guess");
-        // A field of 12 bits may be a part of a longer field.
+        // A field of 12 bits may be part of a longer field.
         let is_long = matches!(&signal.origin, SignalOrigin::Field(own) if own.signal.layout.length_bits > 12);
         evidence.add(0.5, is_long, "");
         evidence.add(1.0, evidence.has_both_signs(), "has both signs");
         return evidence;
     };
-    // If the values of a signed field of 24 or 32 bits fit into 16 bits, the upper bits only repeat the sign. This is
-    // hardly a coincidence.
+    // If a signed field of 24 or 32 bits fits into 16 bits, the upper bits only repeat the sign. This hardly occurs by
+    // chance.
     let needed = 32_768.0 * field.factor;
     let is_extended = field.length > 16 && evidence.low >= -needed && evidence.high <= needed && evidence.low < 0.0;
-    // The 32-bit field contains the shorter fields, so it gets more points.
+    // The 32-bit field gets more points than the shorter fields that it contains.
     let points = if field.length == 32 { 3.0 } else { 2.0 };
     evidence.add(points, is_extended, &format!("a signed number of {} bits", field.length));
     evidence.add(-1.0, evidence.high - evidence.low < 1.0, "hardly moves");
@@ -199,12 +192,10 @@ impl LogSignal {
         good >= 0.8 * (good + bad)
     }
 
-    /// Whether only the values of the signal are known, but not its name or unit.
     fn is_unnamed(&self) -> bool {
         matches!(self.origin, SignalOrigin::Raw(..) | SignalOrigin::Field(_))
     }
 
-    /// Whether two fields of one answer or message overlap.
     fn shares_bits(&self, other: &Self) -> bool {
         if let (SignalOrigin::Field(own), SignalOrigin::Field(others)) = (&self.origin, &other.origin) {
             return own.id == others.id && own.signal.layout.overlaps(&others.signal.layout);
@@ -216,7 +207,6 @@ impl LogSignal {
         own == others && spans.is_some_and(|(a, b)| a.0 <= b.1 && b.0 <= a.1)
     }
 
-    /// Returns the field if the signal was found in an answer without a definition.
     fn field(&self) -> Option<&crate::import::DiagnosticSignal> {
         match &self.origin {
             SignalOrigin::Raw(_, field) => Some(field),
@@ -236,7 +226,7 @@ fn current(index: usize, signal: &LogSignal) -> Option<Evidence> {
     Some(evidence)
 }
 
-/// Plausible voltages of one cell in a group (V), also of a failing one.
+/// Plausible voltages of a cell in a group (V), including a failing cell.
 const CELL_V: (f64, f64) = (1.5, 4.5);
 
 fn single_cell(index: usize, signal: &LogSignal, label: &PackLabel) -> Option<Evidence> {
@@ -278,8 +268,8 @@ fn cell_group(group: &SignalGroup, signals: &[LogSignal]) -> Option<Evidence> {
     Some(Evidence { members, name, bus, score, low, high, positive: None, is_sum: false })
 }
 
-/// Returns the mean correlation between the changes of the first member and the changes of the next few members, and
-/// whether this mean is at least 0.3.
+/// Returns the mean correlation between the changes of the first member and the next eight, and whether it is at least
+/// 0.3.
 fn moves_together(members: &[usize], signals: &[LogSignal]) -> (f64, bool) {
     let first = &signals[members[0]].series;
     let others = members.iter().skip(1).take(8);
@@ -326,7 +316,7 @@ fn soh(index: usize, signal: &LogSignal) -> Option<Evidence> {
     Evidence::new(index, signal, PackQuantity::Soh, (40.0, 110.0))
 }
 
-/// If the voltages do not show the sign of a current, takes it from the description.
+/// If the voltages do not show the sign of a current, the description decides.
 fn state_direction(current: &mut Evidence, signals: &[LogSignal]) {
     let stated = signals[current.members[0]].stated;
     if let (None, Some(direction)) = (current.positive, stated) {
@@ -335,11 +325,10 @@ fn state_direction(current: &mut Evidence, signals: &[LogSignal]) {
     }
 }
 
-/// Compares the states of charge with each other. Candidates that agree confirm each other.
+/// Compares the states of charge with each other. Equal candidates confirm each other.
 fn compare_socs(socs: &mut [Evidence], signals: &[LogSignal]) {
-    /// Largest difference between two states of charge that agree (%).
     const AGREEMENT: f64 = 3.0;
-    /// Below this value (%), signals agree by chance: unused signals are zero.
+    /// Lower values (%) are not compared, because unused signals are zero.
     const EMPTY: f64 = 1.0;
     let means: Vec<f64> = socs.iter().map(|soc| signals[soc.members[0]].series.extent.mean()).collect();
     let agree = |mean: f64, other: f64| mean >= EMPTY && other >= EMPTY && (other - mean).abs() <= AGREEMENT;
@@ -376,27 +365,26 @@ fn compare_sums(voltages: &mut [Evidence], cells: &mut [Evidence], signals: &[Lo
 }
 
 /// Finds for each current the voltage that responds best. The direction of the response gives the sign of the current.
-/// If several currents select the same voltage, the voltage gets points only for the first of them, the best-ranked. A
-/// group of cells is represented by its first cell.
+/// If several currents select the same voltage, only the best-ranked current gives it points. The first cell represents
+/// a group of cells.
 fn compare_currents(
     voltages: &mut [Evidence],
     cells: &mut [Evidence],
     currents: &mut [Evidence],
     signals: &[LogSignal],
 ) {
-    // Known voltages have a name, belong to a group, or equal the sum of the cells. If any voltage is known, only known
-    // voltages are compared.
+    // A known voltage has a name, belongs to a group, or equals the sum of the cells. If there are known voltages, only
+    // they are compared.
     let is_known =
         |voltage: &Evidence| voltage.is_sum || !signals[voltage.members[0]].is_unnamed() || voltage.members.len() > 1;
     let has_known = voltages.iter().chain(cells.iter()).any(is_known);
     for current in currents.iter_mut().take(40) {
         let related = |voltage: &Evidence| response(&signals[voltage.members[0]], &signals[current.members[0]]);
         let compared = voltages.iter_mut().take(40).chain(cells.iter_mut().take(5));
-        // A limit of the voltage is a calculated value and does not show the sign.
+        // A voltage limit is a calculated value, so its response does not show the sign.
         let is_limit = |voltage: &Evidence| voltage.low > 60.0 && signals[voltage.members[0]].label.says_extreme();
         let compared = compared.filter(|voltage| !is_limit(voltage) && (!has_known || is_known(voltage)));
         let found = compared.filter_map(|voltage| Some((related(voltage)?, voltage)));
-        // Prefer a voltage with more evidence.
         let weight = |slope: Slope, voltage: &Evidence| slope.correlation().abs() + 0.05 * voltage.score.points;
         let best = found.max_by(|a, b| weight(a.0, a.1).total_cmp(&weight(b.0, b.1)));
         let Some((slope, voltage)) = best else { continue };
@@ -424,9 +412,9 @@ fn compare_currents(
 fn response(voltage: &LogSignal, current: &LogSignal) -> Option<Slope> {
     let shares_bits = voltage.shares_bits(current);
     let slope = Slope::between(&voltage.series, &current.series).filter(|_| !shares_bits)?;
-    // 4 milliohms to 4 ohms at 400 V.
+    // The range corresponds to 4 milliohms to 4 ohms at 400 V.
     let is_plausible = (1e-5..=1e-2).contains(&(slope.ohm.abs() / voltage.series.extent.mean()));
-    // Among many fields without names, some agree by chance.
+    // There are many unnamed fields, so some agree by chance.
     let is_raw = voltage.is_unnamed() || current.is_unnamed();
     let correlation = slope.correlation().abs();
     let is_significant = slope.strength() >= if is_raw { 4.0 } else { 2.0 };

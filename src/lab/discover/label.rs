@@ -1,16 +1,15 @@
-//! What the owner knows about a pack from its label: chemistry, capacity and number of cells. Every part is optional.
+//! Parses the label of a pack: chemistry, capacity and number of cells. Every part is optional.
 //!
-//! In: a text such as `nmc:64Ah:98s`. Out: the parts, and the voltages and resistances that follow from them. These
-//! decide the scale of a field that no file describes.
+//! Input: a text such as `nmc:64Ah:98s`. Output: the parts, and the voltages and resistances that follow from them.
+//! These voltages and resistances decide the scale of a field that no file describes.
 
 use std::str::FromStr;
 
 use crate::cell::{Chemistry, Label};
 
-/// Resistance of a usual cell over some seconds, times its capacity (ohm Ah): the immediate and the 10 s part of
-/// the chemistry model.
+/// Resistance of a usual cell times its capacity (ohm Ah): the immediate part and the 10 s part of the chemistry model.
 const OHM_AH: f64 = 0.1;
-/// Voltages of a lithium cell in use, whatever its chemistry (V).
+/// Voltage range of lithium cells of any chemistry (V).
 const ANY_CELL_V: (f64, f64) = (2.5, 4.4);
 
 /// Parts of a pack's label.
@@ -25,12 +24,11 @@ pub struct PackLabel {
 }
 
 impl PackLabel {
-    /// The cell on the label; `None` if the chemistry or the capacity is missing.
+    /// Returns the label of a cell; `None` if the chemistry or the capacity is missing.
     pub fn cell(&self) -> Option<Label> {
         Some(Label::usual(self.chemistry?, self.capacity_ah?))
     }
 
-    /// Plausible voltages of a cell (V).
     pub(super) fn cell_v(&self) -> (f64, f64) {
         self.chemistry.map_or(ANY_CELL_V, |chemistry| {
             let (low, high) = chemistry.usual_voltages_v();
@@ -38,13 +36,13 @@ impl PackLabel {
         })
     }
 
-    /// Plausible voltages of the pack (V); `None` if the number of cells is unknown.
     pub(super) fn pack_v(&self) -> Option<(f64, f64)> {
         let (cells, (low, high)) = (f64::from(self.cells?), self.cell_v());
         Some((cells * low, cells * high))
     }
 
-    /// Usual resistance of a pack, relative to its voltage (1/A): ohm per V. Without a capacity, that of a car.
+    /// Returns the usual resistance of a pack divided by its voltage (1/A). Without a capacity, the value of a car's
+    /// pack is used.
     pub(super) fn ohm_per_v(&self) -> f64 {
         self.capacity_ah.map_or(2.5e-4, |capacity_ah| OHM_AH / capacity_ah / 3.6)
     }
@@ -85,7 +83,7 @@ impl PackLabel {
     }
 }
 
-/// A chemistry by its name, with or without `-graphite`.
+/// Returns the chemistry with this name. The suffix `-graphite` is optional.
 fn chemistry(name: &str) -> Option<Chemistry> {
     let is_named = |(_, full): &(Chemistry, &str)| *full == name || full.strip_suffix("-graphite") == Some(name);
     Chemistry::ALL.into_iter().find(is_named).map(|(chemistry, _)| chemistry)

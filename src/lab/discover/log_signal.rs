@@ -1,5 +1,4 @@
-//! Defines a signal of the log. The signal's description (name, position, scaling) comes from a file or from the
-//! search.
+//! Defines a signal of the log. Its description (name, position, scaling) comes from a file or from the search.
 
 use super::PositiveDirection;
 use super::capture::AnswerKey;
@@ -10,8 +9,8 @@ use crate::import::DiagnosticSignal;
 use crate::quantity::BusIndex;
 use crate::wiring::evidence::{Series, SignalLabel};
 
-/// A field of a message: the message's identifier, the signal and, if the first byte selects a page (multiplexer), the
-/// value of that byte.
+/// A field of a message: identifier, signal and, if the first byte selects a page (multiplexer), the value of that
+/// byte.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct MessageField {
     pub(super) id: CanId,
@@ -19,23 +18,20 @@ pub(super) struct MessageField {
     pub(super) signal: Signal,
 }
 
-/// Origin of a signal's description.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum SignalOrigin {
     /// A DBC file, given by its index.
     Dbc(usize),
     /// A definition of diagnostic answers, given by the index of its table.
     Defined(usize),
-    /// No description: a field found in a diagnostic answer.
+    /// A field that the search found in a diagnostic answer.
     Raw(AnswerKey, Box<DiagnosticSignal>),
-    /// No description: a field found in a message.
+    /// A field that the search found in a message.
     Field(Box<MessageField>),
 }
 
-/// A signal of the log.
 #[derive(Debug)]
 pub(super) struct LogSignal {
-    /// `Message.Signal`.
     pub(super) name: String,
     pub(super) bus: BusIndex,
     pub(super) origin: SignalOrigin,
@@ -47,12 +43,12 @@ pub(super) struct LogSignal {
     pub(super) is_read_signed: bool,
     /// Factor and offset from the description's unit to V, A, degrees Celsius or percent.
     pub(super) conversion: (f64, f64),
-    /// Direction of a positive current that the description states.
+    /// Direction of a positive current according to the description.
     pub(super) stated: Option<PositiveDirection>,
 }
 
 impl LogSignal {
-    /// Creates an unnamed field. Its label contains only a unit, the unit of the assumed quantity.
+    /// Creates an unnamed field. Its label contains only the unit of the assumed quantity.
     pub(super) fn unnamed(
         name: String,
         bus: BusIndex,
@@ -65,8 +61,8 @@ impl LogSignal {
     }
 }
 
-/// Returns the longest run of items in which `goes_with` holds between the first item and every other one. If several
-/// runs are equally long, the last one is returned. A `None` in `items` ends a run.
+/// Returns the longest run of items in which `goes_with` holds between the first item and every other item. If several
+/// runs are equally long, the last is returned. A `None` ends a run.
 pub(super) fn longest_run<T>(items: impl Iterator<Item = Option<T>>, goes_with: impl Fn(&T, &T) -> bool) -> Vec<T> {
     let (mut best, mut run) = (Vec::new(), Vec::new());
     for item in items.chain([None]) {

@@ -1,9 +1,9 @@
 //! Searches diagnostic answers for cell voltages, pack voltage, current and temperatures, in the bytes that no
 //! definition describes.
 //!
-//! A row of cell voltages is a run of at least [`MIN_CELLS`] neighbouring values of 8 or 16 bits. In one byte order and
-//! at one of the common scales, all these values are plausible voltages and similar to each other. Other fields are tried at every byte with
-//! common scales. [`judge`](super::judge) then decides from the values which quantity a field carries.
+//! A row of cell voltages is a run of at least [`MIN_CELLS`] neighbouring values of 8 or 16 bits. With one byte order
+//! and one common scale, all its values are plausible and similar voltages. Other fields are tried at every byte with
+//! common scales; [`judge`](super::judge) decides which quantity they carry.
 
 use std::collections::BTreeMap;
 
@@ -16,34 +16,32 @@ use crate::import::{DiagnosticSignal, NumberRange};
 use crate::quantity::{BusIndex, Fault};
 use crate::wiring::evidence::Series;
 
-/// Part of a cell's name before its number.
 pub(super) const CELL: &str = "Cell";
-/// Smallest number of cells in a row.
 const MIN_CELLS: usize = 8;
 /// Plausible voltages of a cell in use (V), if the label does not state the chemistry.
 const CELL_V: (f64, f64) = (2.0, 4.5);
-/// Lengths of a cell voltage in bits, each with the scales to try (V) per code.
+/// Lengths of a cell voltage in bits, each with the scales to try (V per code).
 const CELL_SCALES: [(u32, &[f64]); 2] = [(16, &[0.001, 0.0001, 0.002, 0.005, 0.01]), (8, &[0.02, 0.01, 0.05])];
 /// Plausible voltages of a pack (V), if the label does not state the number of cells.
 const PACK_V: (f64, f64) = (100.0, 950.0);
-/// Scales of a pack voltage of 16 bits (V) per code.
+/// Scales of a 16-bit pack voltage (V per code).
 const PACK_SCALES: [f64; 5] = [0.1, 0.01, 0.5, 0.25, 1.0];
-/// Lengths of a current in bits, each with the scales to try (A) per code.
+/// Lengths of a current in bits, each with the scales to try (A per code).
 const CURRENT_FORMS: [(u32, &[f64]); 3] =
     [(16, &[0.1, 0.01, 0.05, 0.5, 0.025]), (24, &[0.001, 0.01]), (32, &[1.0 / 1024.0, 0.001])];
 /// Smallest number of answers in which a field is searched.
 const MIN_ANSWERS: usize = 3;
 
-/// For each form of a row, the number of cells found so far. A row of the same form in the next answer continues the
-/// cell numbers.
+/// Number of cells found so far for each form of a row. A row of the same form in the next answer continues the
+/// numbers.
 #[derive(Debug, Default)]
 pub(super) struct CellRows(BTreeMap<RowForm, u32>);
 
-/// Form of a row: controller (bus, CAN identifier, address byte), first bit, length, byte order, and scale (as the bits
-/// of an `f64`).
+/// Form of a row: bus, CAN identifier and address byte of the controller, first bit, length, byte order, scale (bits of
+/// an `f64`).
 type RowForm = (BusIndex, CanId, Option<u8>, u32, u32, bool, u64);
 
-/// Returns the possible signals in these answers. The bits in `described` (first, last) are left out.
+/// Returns the possible signals in these answers, without the bits in `described` (first, last).
 pub(super) fn signals(
     key: &AnswerKey,
     answers: &Answers,
@@ -81,14 +79,12 @@ pub(super) fn signals(
 }
 
 impl LogSignal {
-    /// Returns the first and last bit of a field without a definition.
     pub(super) fn span(&self) -> Option<(u32, u32)> {
         let SignalOrigin::Raw(_, field) = &self.origin else { return None };
         Some((field.bit, field.bit + field.length - 1))
     }
 }
 
-/// Creates a field whose name contains its position.
 fn field(what: &str, bit: u32, length: u32, signed: bool, factor: f64) -> DiagnosticSignal {
     let unit = match what {
         "Temperature" | "Sensor" => "degC",
@@ -118,7 +114,7 @@ fn signal(key: &AnswerKey, answers: &Answers, form: DiagnosticSignal) -> Option<
         "A" => Quantity::Current,
         _ => Quantity::Voltage,
     };
-    // Cells are numbered across all answers. The names of other fields contain the name of their answer.
+    // Cells are numbered across all answers. Other names contain the service and the identifier of their answer.
     let mut form = form;
     if !form.name.starts_with(CELL) {
         form.name = format!("D{:02X}{:02X}_{}", key.service, key.identifier, form.name);
@@ -128,7 +124,6 @@ fn signal(key: &AnswerKey, answers: &Answers, form: DiagnosticSignal) -> Option<
     is_known.then(|| LogSignal::unnamed(name, key.bus, SignalOrigin::Raw(*key, Box::new(form)), quantity, series))
 }
 
-/// Returns the name of the table of a controller's answers, for example `Answer7BB`.
 pub(super) fn table_name(key: &AnswerKey) -> String {
     let extension = key.extension.map(|byte| format!("_{byte:02X}")).unwrap_or_default();
     format!("Answer{}{extension}", key.response)
@@ -138,20 +133,20 @@ fn is_plausible(signal: &LogSignal, pack: &PackLabel) -> bool {
     let (SignalOrigin::Raw(_, field), LogSignal { label, series, .. }) = (&signal.origin, signal) else { return false };
     let within = |low: f64, high: f64| series.extent.min >= low && series.extent.max <= high;
     if label.has_unit_of(Quantity::Voltage) {
-        // Larger codes (0xFF00 and above) mean "no value" or are the sign bytes of a longer number.
+        // Codes from 0xFF00 on mean "no value" or are the sign bytes of a longer number.
         let (low_v, high_v) = pack.pack_v().unwrap_or(PACK_V);
         within(low_v, high_v) && series.extent.max < 65_280.0 * field.factor
     } else if label.has_unit_of(Quantity::Current) {
         within(-1500.0, 1500.0) && !series.is_constant()
     } else {
-        // A constant 0 or 0xFF means "no value".
+        // A constant 0 or 0xFF, with or without the offset of -40, means "no value".
         let is_absent = series.values.kept().iter().all(|value| [-1.0, 0.0, 215.0, -40.0].contains(value));
         within(-35.0, 75.0) && series.largest_step() <= 2.0 && !is_absent
     }
 }
 
-/// Finds the best row of temperatures: bytes at a constant distance with similar values that change slowly. If sensors
-/// are missing, their bytes (0xFF) are skipped.
+/// Finds the best row of temperatures: bytes at a constant distance with similar, slowly changing values. The bytes of
+/// missing sensors (0xFF) are skipped.
 fn temperatures(key: &AnswerKey, answers: &Answers, bytes: usize) -> Vec<LogSignal> {
     let mut best: Vec<LogSignal> = Vec::new();
     let mut best_weight = 0;
@@ -160,7 +155,7 @@ fn temperatures(key: &AnswerKey, answers: &Answers, bytes: usize) -> Vec<LogSign
             let row = temperature_row(key, answers, (first, bytes), distance, offset);
             let values: std::collections::BTreeSet<u64> =
                 row.iter().flat_map(|signal| signal.series.values.kept()).map(|value| value.to_bits()).collect();
-            // Bytes that all have the same constant value are more likely to be parts of other numbers.
+            // Bytes with the same constant value are probably parts of other numbers.
             let weight = if values.len() > 1 { 2 * row.len() + usize::from(distance > 1) } else { 0 };
             if row.len() >= 3 && weight > best_weight {
                 (best, best_weight) = (row, weight);
@@ -183,7 +178,7 @@ fn temperature_row(
         if is_absent(byte) && !row.is_empty() {
             continue;
         }
-        // The row ends if the step to this byte jumps over a missing sensor.
+        // The row ends if a byte between two of its positions belongs to a missing sensor.
         if !row.is_empty() && (byte + 1 - distance..byte).any(is_absent) {
             break;
         }
@@ -192,7 +187,7 @@ fn temperature_row(
         let next = signal(key, answers, form).filter(|signal| is_plausible(signal, &PackLabel::default()));
         let is_near = |signal: &LogSignal| {
             row.first()
-                // Largest difference between temperature sensors of a pack (K).
+                // Temperature sensors of a pack differ by at most 12 K.
                 .is_none_or(|first| (signal.series.extent.mean() - first.series.extent.mean()).abs() <= 12.0)
         };
         match next.filter(is_near) {
@@ -203,7 +198,6 @@ fn temperature_row(
     row
 }
 
-/// Finds the longest row of cell voltages; returns one signal per cell.
 fn cells(key: &AnswerKey, answers: &Answers, bytes: usize, rows: &mut CellRows, label: &PackLabel) -> Vec<LogSignal> {
     let mut best: Option<(usize, DiagnosticSignal)> = None;
     let cell_v = label.chemistry.map_or(CELL_V, |_| label.cell_v());
@@ -238,8 +232,8 @@ fn cells(key: &AnswerKey, answers: &Answers, bytes: usize, rows: &mut CellRows, 
     (0..count).filter_map(|n| signal(key, answers, form.of_series(n))).collect()
 }
 
-/// Returns the length and the first byte of the longest run of plausible cell voltages of a form. Voltages are read at
-/// the bytes `first`, `first` + width of the form, ...
+/// Returns length and first byte of the longest run of plausible cell voltages. Voltages are read from `first` on, at
+/// multiples of the field width.
 fn row(
     answers: &Answers,
     bytes: usize,
@@ -262,7 +256,7 @@ fn row(
         is_cell.then_some((start, value))
     };
     let starts = (first..bytes).step_by(width).filter(|start| start + width <= bytes);
-    // Largest difference between cells of a pack (V).
+    // Cells of a pack differ by at most 0.35 V.
     let run = longest_run(starts.map(cell), |(_, first_v), (_, next_v)| (next_v - first_v).abs() <= 0.35);
     Some((run.len(), run.first()?.0))
 }

@@ -1,5 +1,5 @@
 //! Collects the signals of a log with their values. DBC files and definitions of diagnostic answers describe signals.
-//! The search finds further signals in undescribed bytes of answers and, without DBC files, in messages.
+//! Further signals are searched for in undescribed bytes of answers and, without DBC files, in messages.
 
 use super::PositiveDirection;
 use super::capture::{AnswerKey, Answers, Capture, MessageKey, Payloads};
@@ -16,7 +16,6 @@ use crate::wiring::evidence::{STEADY_A, Series, SignalLabel, recorded_value};
 /// Smallest number of valid values of a signal.
 const MIN_VALUES: u64 = 2;
 
-/// Descriptions given by the user.
 #[derive(Debug, Default)]
 pub(super) struct Descriptions {
     pub(super) databases: Vec<Database>,
@@ -24,8 +23,7 @@ pub(super) struct Descriptions {
     pub(super) label: PackLabel,
 }
 
-/// Returns all signals of the log that have values, in a fixed order, and remarks on described battery signals without
-/// values.
+/// Returns all signals that have values, in a fixed order, and remarks on described battery signals without values.
 pub(super) fn signals(capture: &Capture, descriptions: &Descriptions) -> (Vec<LogSignal>, Vec<String>) {
     let mut signals = Vec::new();
     let mut rows = raw::CellRows::default();
@@ -53,7 +51,7 @@ pub(super) fn signals(capture: &Capture, descriptions: &Descriptions) -> (Vec<Lo
     (usable, remarks)
 }
 
-/// Returns a remark on a battery voltage or current that is in the log but never has a valid value.
+/// Returns a remark on a battery voltage or current that never has a valid value although it is in the log.
 fn remark(signal: &LogSignal) -> Option<String> {
     let LogSignal { label, series, .. } = signal;
     let is_wanted = label.has_unit_of(Quantity::Voltage) || label.has_unit_of(Quantity::Current);
@@ -69,18 +67,17 @@ fn is_answer(table: &DiagnosticTable, key: &AnswerKey) -> bool {
         == (key.response, key.extension, key.service, key.identifier)
 }
 
-/// Returns factor and offset that convert a unit to V, A, degrees Celsius or percent.
 fn conversion(unit: &str) -> (f64, f64) {
     SignalUnit::parse(unit).map_or((1.0, 0.0), |unit| (unit.factor, unit.offset))
 }
 
 fn of_message(key: MessageKey, payloads: &Payloads, file: usize, message: &Message) -> Vec<LogSignal> {
     let of_signal = |signal: &Signal| {
-        // The channel has no effect here.
+        // A binding needs a channel, which has no effect here.
         let mut binding = Binding::new(key.0, message, signal, Channel::Current).ok()?;
         (binding.scale, binding.offset) = conversion(&signal.unit);
         let label = SignalLabel::new(&message.name, &signal.name, &signal.unit);
-        // A percentage never reaches 1000: such a signal counts tenths.
+        // A percentage never reaches 1000, so a signal with this maximum counts tenths of a percent.
         if (label.says_soc() || label.says_soh()) && signal.layout.maximum == 1000.0 {
             binding.scale = 0.1;
         }
@@ -109,7 +106,8 @@ fn of_message(key: MessageKey, payloads: &Payloads, file: usize, message: &Messa
     message.signals.iter().filter(|signal| signal.layout.length_bits > 2).filter_map(of_signal).collect()
 }
 
-/// The offset (A) of a current whose description has none: its values never come near zero, and no pack has them.
+/// Returns the offset (A) that is missing in the description of a current. A pack's current comes near zero, so an
+/// offset is missing if the values never do.
 fn missing_offset(series: &Series, signal: &Signal) -> Option<f64> {
     let factor = signal.layout.factor;
     if series.extent.min.abs().min(series.extent.max.abs()) < STEADY_A || factor <= 0.0 || signal.layout.offset != 0.0 {
@@ -118,7 +116,7 @@ fn missing_offset(series: &Series, signal: &Signal) -> Option<f64> {
     series.zero_code(factor).filter(|zero| *zero != 0.0).map(|zero| -zero * factor)
 }
 
-/// The direction of a positive current that a DBC's comment states, such as "positive = charge".
+/// Returns the direction of a positive current that a DBC's comment states, such as "positive = charge".
 fn stated_direction(comment: &str) -> Option<PositiveDirection> {
     let lower = comment.to_lowercase();
     lower.split([',', ';', '.', '\n', '/']).find_map(|clause| {
@@ -164,8 +162,8 @@ fn of_definition(
     each.collect()
 }
 
-/// Returns the values of a defined signal. An unsigned current is read as signed if this reduces the range of its
-/// values to less than a quarter. Read as unsigned, a few negative amperes look like thousands.
+/// Returns the values of a defined signal, and whether it is read as signed. An unsigned current is read as signed if
+/// this reduces its range to less than a quarter. Read as unsigned, a few negative amperes look like thousands.
 fn values(answers: &Answers, signal: &DiagnosticSignal, conversion: (f64, f64), is_current: bool) -> (Series, bool) {
     let collect = |signal: &DiagnosticSignal| {
         let value = |data: &[u8]| {

@@ -1,4 +1,4 @@
-//! Tests the search on synthetic logs, with signals that must be found and signals that must not be found.
+//! Tests the search on synthetic logs that contain signals to find and signals to ignore.
 
 #![allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
 
@@ -22,7 +22,6 @@ BO_ 512 Motor: 8 A
  SG_ LinkVoltage : 16|16@1+ (0.1,0) [0|1000] "V" A
 "#;
 
-/// A current that does not repeat within a short time (A).
 fn load_a(step: i32) -> f64 {
     let x = f64::from(step);
     (80.0 * (x * 0.7).sin() + 40.0 * (x * 0.23).cos()).round()
@@ -45,7 +44,7 @@ fn discover(discoverer: &Discoverer) -> Discovery {
     discoverer.finish(&["can0".to_owned()])
 }
 
-/// A pack whose voltage falls by 0.1 V per A. `sign` is the sign of the current on the bus.
+/// Creates a pack whose voltage falls by 0.1 V per A. `sign` is the sign of the current on the bus.
 fn pack(sign: f64) -> Discoverer {
     let mut discoverer = Discoverer::default();
     discoverer.add_database(Database::parse(DBC).unwrap());
@@ -100,8 +99,8 @@ fn configuration_needs_cell_count_and_has_all_inputs() {
     assert!(pack.open.iter().any(|question| question.contains("cell_model")), "{:?}", pack.open);
 }
 
-/// A controller like the one in a Nissan Leaf. Group 01 contains current and pack voltage, group 02 contains 96 cells
-/// in mV; both are sent every second. If `is_asked` is set, the log also contains the requests.
+/// Simulates a controller like that of a Nissan Leaf. Group 01 contains current and pack voltage, group 02 contains 96
+/// cells in mV. Both are sent every second. If `is_asked` is set, the log also contains the requests.
 fn answers(seconds: i32, is_asked: bool) -> Discoverer {
     let mut discoverer = Discoverer::default();
     for step in 0..seconds {

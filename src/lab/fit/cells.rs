@@ -1,14 +1,14 @@
-//! Determines how the cells of a pack differ from their mean: capacity, resistance and charge of each cell, and notes
-//! on outliers.
+//! Determines how each cell of a pack differs from the mean cell in capacity, resistance and charge. Writes notes on
+//! outliers.
 //!
-//! Input: for some rows, the difference between the voltage of every cell and the mean voltage (V); and the fitted
-//! records of the mean cell. Output: a [`CellDeviation`] per cell. All cells share one curve and one current sensor, so
-//! errors of the model and of the current cancel. The difference d is linear in the deviations of the cell:
+//! Input: the voltage of every cell minus the mean voltage (V), and the fitted records of the mean cell. All cells
+//! share one curve and one current sensor, so errors of the model and of the current cancel. The voltage difference d
+//! is linear in the deviations of the cell:
 //!
 //! `d = slope (dSOC + (q / C) dlnC - (t / C) leakage) - drop dlnR + offset`
 //!
-//! Here `slope` is the slope of the OCV over SOC, and `drop` is the voltage drop under load. The charge taken out is q,
-//! the time is t, and the capacity is C. One least-squares solution per cell gives the deviations.
+//! Here `slope` is the slope of the OCV over SOC, `drop` is the voltage drop under load, q is the charge taken out, t
+//! is the time, and C is the capacity. One least-squares solution per cell gives the deviations.
 
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
@@ -18,39 +18,37 @@ use crate::ident::parameters::ParameterTables;
 use crate::ident::pass::residuals;
 use crate::ident::record::Record;
 
-/// Shortest time between two recorded differences (s). Errors of a difference are correlated over [`REPEATS_S`], so a
-/// shorter interval adds hardly any information.
+/// Shortest time between two recorded differences (s). More frequent differences add hardly any information, because
+/// their errors are correlated over [`REPEATS_S`].
 const PERIOD_S: f64 = 5.0;
 /// Standard deviations before the fit: ln capacity, ln resistance, sensor offset (V), leakage (share of the capacity
 /// per h), SOC.
 const PRIOR: [f64; OWN + 1] = [0.15, 0.4, 0.003, 0.002, 0.15];
 /// Number of unknowns of a cell, not counting its SOC at the start of each stretch (a part of a log without gaps).
 const OWN: usize = 4;
-/// Standard deviation of the error of a difference (V). Next constant: correlation time of this error (s).
+/// Standard deviation of the error of a difference (V).
 const DISTANCE_V: f64 = 0.002;
+/// Correlation time of the error of a difference (s).
 const REPEATS_S: f64 = 50.0;
-/// Smallest number of cells for a comparison.
 const LEAST_CELLS: usize = 4;
-/// A cell is an outlier if its distance from the median exceeds all of three limits. The first is this number of robust
-/// standard deviations of all cells. The second is [`OWN_DEVIATIONS`] standard deviations of the cell's value; it does
-/// not apply to the residual. The third is [`FLOOR`]: the smallest relevant difference of capacity, of resistance, of
-/// the residual (V) and of the leakage (share of the capacity per h).
+/// Smallest distance of an outlier from the median, in robust standard deviations of all cells. The limits
+/// [`OWN_DEVIATIONS`] and [`FLOOR`] apply too.
 const SPREADS: f64 = 5.0;
+/// Smallest distance of an outlier from the median, in standard deviations of its own value. Not applied to the
+/// residual.
 const OWN_DEVIATIONS: f64 = 3.0;
+/// Smallest distance of an outlier from the median: capacity (relative), resistance (relative), residual (V), leakage
+/// (share of the capacity per h).
 const FLOOR: [f64; 4] = [0.03, 0.15, 0.004, 0.0005];
 
-/// Differences of all cells from their mean during one stretch.
 #[derive(Debug, Clone, Default)]
 pub(super) struct CellDistances {
-    /// Time (s).
     pub(super) time_s: Vec<f64>,
-    /// Differences (V): for each time, the values of all cells; NaN = no reading.
     pub(super) distance_v: Vec<f32>,
 }
 
 impl CellDistances {
-    /// Records the differences of the cells from their mean `mean_v`, unless the last recorded time is less than
-    /// [`PERIOD_S`] ago.
+    /// Records the differences of the cells from their mean `mean_v`, at most once per [`PERIOD_S`].
     pub(super) fn push(&mut self, time_s: f64, mean_v: f64, voltage_v: &[f64]) {
         if voltage_v.len() >= LEAST_CELLS && self.time_s.last().is_none_or(|last_s| time_s - last_s >= PERIOD_S) {
             self.time_s.push(time_s);
@@ -74,7 +72,6 @@ pub struct CellDeviation {
     pub residual_v: f64,
 }
 
-/// Coefficients of the unknowns in the equation of the differences, at one time.
 struct Factors {
     stretch: usize,
     weight: f64,
@@ -84,8 +81,7 @@ struct Factors {
     drop_v: f64,
 }
 
-/// Returns the deviations of all cells. The list is empty if there are fewer than [`LEAST_CELLS`] cells or no
-/// differences.
+/// Returns the deviations of all cells; empty = there are fewer than [`LEAST_CELLS`] cells, or no differences.
 pub(super) fn fit(
     cells: usize,
     distances: &[&CellDistances],
@@ -109,7 +105,7 @@ pub(super) fn fit(
     (0..cells).into_par_iter().map(|cell| fit_cell(cell, distances.len(), &factors, &all_v)).collect()
 }
 
-/// Returns the coefficients at the time of each difference, computed from the latest row up to this time.
+/// Returns the coefficients for each difference, computed from the latest row that is not after the difference.
 fn factors(
     stretch: usize,
     distances: &CellDistances,
@@ -160,7 +156,7 @@ fn fit_cell(cell: usize, stretches: usize, factors: &[Factors], all_v: &[&[f32]]
             }
         }
     }
-    // The prior adds a positive number to every diagonal element, so the matrix is positive definite.
+    // The prior makes the matrix positive definite.
     let Some(inverse) = normal.cholesky().map(|factor| factor.inverse()) else { return CellDeviation::unknown() };
     let x = &inverse * right;
     let (mut squares, mut weights) = (0.0, 0.0);
@@ -173,7 +169,7 @@ fn fit_cell(cell: usize, stretches: usize, factors: &[Factors], all_v: &[&[f32]]
         return CellDeviation::unknown();
     }
     let residual_v = (squares / weights).sqrt();
-    // If residuals are larger than expected, every row carries less information.
+    // If the residual exceeds [`DISTANCE_V`], the standard deviations grow in proportion.
     let scale = (residual_v / DISTANCE_V).max(1.0);
     let ratio = |i: usize| {
         let ratio = libm::exp(x[i]);
@@ -190,7 +186,7 @@ fn fit_cell(cell: usize, stretches: usize, factors: &[Factors], all_v: &[&[f32]]
 }
 
 impl Factors {
-    /// Returns the indices of the unknowns on which the difference depends, each with its factor.
+    /// Returns the unknowns on which the difference depends, each as index and factor.
     fn terms(&self) -> [(usize, f64); OWN + 1] {
         let soc = (OWN + self.stretch, self.slope_v);
         [(0, self.charge_v), (1, -self.drop_v), (2, 1.0), (3, -self.hours_v), soc]
@@ -198,7 +194,6 @@ impl Factors {
 }
 
 impl CellDeviation {
-    /// Deviation of a cell without readings.
     fn unknown() -> Self {
         let unknown = (f64::NAN, f64::INFINITY);
         Self {
@@ -211,7 +206,6 @@ impl CellDeviation {
     }
 }
 
-/// Returns sentences about the spread of the cells and about each outlier. Cells are counted from 1.
 pub(super) fn notes(cells: &[CellDeviation]) -> Vec<String> {
     if cells.is_empty() {
         return vec![];
@@ -256,7 +250,6 @@ pub(super) fn notes(cells: &[CellDeviation]) -> Vec<String> {
     notes
 }
 
-/// Median and robust standard deviation of a quantity over the cells.
 struct Spread {
     median: f64,
     deviation: f64,
@@ -297,7 +290,7 @@ mod tests {
         assert!(found[2].starts_with("cell 8 is an outlier: resistance +4"), "{found:?}");
         assert!(found[3].starts_with("cell 10 is an outlier: voltage differs from the others by 20.0 mV"), "{found:?}");
         assert_eq!(found.len(), 4);
-        // A difference that is within the uncertainty of the cell's own value does not count.
+        // A difference within the uncertainty of the cell's own value is not an outlier.
         cells[3].capacity_ratio.1 = 0.05;
         assert_eq!(notes(&cells).len(), 3);
     }

@@ -1,8 +1,7 @@
 //! Tests whether another chemistry explains the logs better than the chemistry on the label.
 //!
-//! Input: the mean voltage of the cells in each stretch (a part of a log without gaps), and the label of the cell.
-//! Output: a sentence if another chemistry is clearly better. All chemistries are compared on the same rows. The rows
-//! are recorded and fitted as in the daemon.
+//! Input: the mean voltage of the cells in each stretch (a part of a log without gaps). All chemistries are compared on
+//! the same rows, which are recorded and fitted as in the daemon.
 
 use crate::cell::notebook::Row;
 use crate::cell::own_model::fit;
@@ -24,8 +23,8 @@ pub(super) fn label_of(model: &CellModel) -> Option<Label> {
     model.spread.and(labels.into_iter().find(|label| label.model().as_ref() == Some(model)))
 }
 
-/// Returns the rows that the daemon would record for these stretches. Each stretch is given with its initial SOC. The
-/// offset of the current sensor is subtracted.
+/// Returns the rows that the daemon would record for these stretches, without the offset of the current sensor. Each
+/// stretch comes with its initial SOC.
 fn rows<'a>(label: &Label, offset_a: f64, stretches: impl Iterator<Item = (&'a MeasuredPart, f64)>) -> Vec<Row> {
     let config = NotebookConfig::new(1, label.rated_ah);
     let mut notebook = Notebook::default();
@@ -43,7 +42,7 @@ fn rows<'a>(label: &Label, offset_a: f64, stretches: impl Iterator<Item = (&'a M
                 unmeasured_s: 0.0,
                 current_a: Some(part.current_a[k] - offset_a),
                 temperature_c: Some(part.temperature_c[k]).filter(|t| t.is_finite()),
-                // Assumed ambient temperature (degrees C); used if a reading has no temperature.
+                // Assumed for readings without temperature (degrees C).
                 ambient_c: 25.0,
                 voltage_v: part.voltage_v[k],
                 is_voltage_frozen: false,
@@ -58,9 +57,9 @@ fn rows<'a>(label: &Label, offset_a: f64, stretches: impl Iterator<Item = (&'a M
 }
 
 /// Compares the chemistries, using the capacity (Ah) and the current offset (A) of a fit. Returns a sentence if another
-/// chemistry is clearly better, or if the rows are too few for a comparison. `error_ratio` is the error of the circuit
-/// model at the coldest temperature, relative to its error when warm. Log likelihoods shrink with the square of this
-/// ratio.
+/// chemistry is clearly better, or if there are too few rows. `error_ratio` is the circuit model's error at the coldest
+/// temperature divided by its error when warm. It scales the margin with its square, because log likelihoods depend on
+/// squared errors.
 pub(super) fn note<'a>(
     label: &Label,
     (capacity_ah, offset_a): (f64, f64),
@@ -72,7 +71,6 @@ pub(super) fn note<'a>(
         let of = if chemistry == label.chemistry { *label } else { label.with_chemistry(chemistry) };
         Some((chemistry, fit::label_cost(&of.prior()?, &rows, &[capacity_ah])?))
     };
-    // Smallest number of rows for a comparison.
     let Some((_, own)) = cost(label.chemistry).filter(|_| rows.len() >= 12) else {
         return Some(format!("too little charge moved to compare {} with other chemistries", label.chemistry.name()));
     };

@@ -1,25 +1,21 @@
-//! Writes notes on quantities that the logs do not determine. For these quantities, the fit keeps the values of the
-//! initial model.
+//! Writes notes on quantities that the logs do not determine. The fit keeps the initial model's values for these
+//! quantities.
 //!
-//! Input: the mean voltage of the cells in each stretch (a part of a log without gaps), the fitted records, and both
-//! capacities (Ah): before and after the fit. Output: notes for the user.
+//! A stretch is a part of a log without gaps.
 
 use crate::filter::{ends, median};
 use crate::ident::MeasuredPart;
 use crate::ident::record::Record;
 
-/// A capacity and its standard deviation (Ah), either before or after a fit.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Capacity {
     pub(super) mean_ah: f64,
     pub(super) std_ah: f64,
 }
 
-/// Returns the notes.
 pub(super) fn notes(parts: &[&MeasuredPart], records: &[Record], before: Capacity, after: Capacity) -> Vec<String> {
     let mut notes = Vec::new();
-    // The logs do not show the capacity if more than this share of its relative standard deviation remains after the
-    // fit.
+    // The logs do not show the capacity if over 70 % of its relative standard deviation remains after the fit.
     let is_unshown = after.std_ah / after.mean_ah > 0.7 * before.std_ah / before.mean_ah;
     if is_unshown {
         notes.push(
@@ -34,7 +30,7 @@ pub(super) fn notes(parts: &[&MeasuredPart], records: &[Record], before: Capacit
             100.0 * span
         ));
     }
-    // A current counts as rest if it would need more than 50 h to discharge the cell.
+    // A current below C/50 (discharge in 50 h) counts as rest.
     let rest_a = after.mean_ah / 50.0;
     let (mut rest_s, mut moved) = (0.0, [0.0; 2]);
     for row in records.iter().flat_map(|record| &record.rows) {
@@ -72,13 +68,12 @@ pub(super) fn notes(parts: &[&MeasuredPart], records: &[Record], before: Capacit
     notes
 }
 
-/// Returns the width of the SOC range of the judged rows.
 fn span(record: &Record) -> f64 {
     let (low, high) = record.judged_ends();
     (high - low).max(0.0)
 }
 
-/// Returns the resolution of the voltage readings: the smallest difference between consecutive unequal readings (V).
+/// Returns the resolution of the voltage: the smallest difference between consecutive unequal readings (V).
 fn step_v(parts: &[&MeasuredPart]) -> f64 {
     let of_part = |part: &&MeasuredPart| {
         let pairs = part.voltage_v.windows(2).take(2000).map(|pair| (pair[1] - pair[0]).abs());

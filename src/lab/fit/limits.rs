@@ -1,10 +1,8 @@
 //! Finds the voltage limits of a cell in its measured data, with the row that shows each limit.
 //!
-//! Input: measured files. Output: lowest and highest voltage (V), each with a note. The note states the file, the row,
-//! the voltage in this row, and the command-line option that overrides the limit. Pulses do not count as limits: a row
-//! counts only if the current has kept its direction, or has been near zero, for [`HELD_S`]. If the data are whole
-//! cycles, the lower limit is the cut-off voltage of the discharges, and the upper limit is the voltage at which
-//! charges are held.
+//! A row counts only if the current has kept its direction, or has been near zero, for [`HELD_S`]; this excludes
+//! pulses. If the data are whole cycles, the lower limit is the cut-off voltage of the discharges, and the upper limit
+//! is the voltage at which charges are held.
 
 use super::FitRequest;
 use crate::error::LabError;
@@ -12,21 +10,19 @@ use crate::measured::{MeasuredFile, MeasuredPart};
 
 /// A voltage below this value comes from a disconnected sensor (V).
 pub(super) const DISCONNECTED_V: f64 = 0.5;
-/// A current that keeps its direction for less than this time is a pulse (s). Pulse tests use 10 to 18 s.
+/// A current that keeps its direction for a shorter time is a pulse (s). Pulse tests use 10 to 18 s.
 const HELD_S: f64 = 30.0;
-/// Current below which a cell rests, as a share of the largest current in this part of the file.
+/// A cell rests below this current, as a share of the largest current in this part of the file.
 const REST_SHARE: f64 = 0.02;
-/// For each group of this many rows, one outlier is ignored at either end of the voltage range.
+/// One outlier per this many rows is ignored at each end of the voltage range.
 const STRAY: usize = 10_000;
 /// Error of a reading at a limit (V).
 const READING_V: f64 = 0.005;
 
-/// A reading with its position.
 #[derive(Debug, Clone, Copy)]
 struct Reading<'a> {
     voltage_v: f64,
     file: &'a MeasuredFile,
-    /// Line of the file.
     line: usize,
 }
 
@@ -36,7 +32,6 @@ impl Reading<'_> {
     }
 }
 
-/// Returns the lowest and highest voltage (V) with notes on the limits that were taken from the data.
 pub(super) fn voltage_limits(
     request: &FitRequest,
     files: &[MeasuredFile],
@@ -52,7 +47,7 @@ pub(super) fn voltage_limits(
     if request.voltage_max_v.is_none() {
         notes.push(format!("voltage_max_v = {high_v} (from {}); --voltage-max overrides it", high.place()));
         let highest = readings(all(), 0.0).into_iter().rev().nth(strays(all()));
-        // Smallest excess over the limit at which pulses are reported (V).
+        // Pulses are reported if they exceed the limit by more than 0.02 V.
         if let Some(pulse) = highest.filter(|pulse| pulse.voltage_v > high_v + 0.02) {
             notes.push(format!("pulses above voltage_max_v do not count: {}", pulse.place()));
         }
@@ -110,11 +105,9 @@ fn held_rows(part: &MeasuredPart, held_s: f64) -> Vec<usize> {
     (0..part.len()).filter(|k| held(k)).collect()
 }
 
-/// Returns the voltage limits of whole cycles.
-///
-/// A complete discharge ends with its first row below the cut-off voltage. Of all these last rows, the row with the
-/// highest voltage is nearest to the cut-off. Cut-offs are multiples of 0.1 V, so the lower limit is this voltage
-/// rounded up to 0.1 V. Aborted discharges do not count. Charges hold their voltage, so the upper limit is the median
+/// Returns the voltage limits of whole cycles. The last row of a complete discharge is the first row below the cut-off
+/// voltage. Of the voltages in these last rows, the highest is nearest to the cut-off. It is rounded up to a multiple
+/// of 0.1 V, as cut-offs are. Aborted discharges do not count. Charges are held at the upper limit, which is the median
 /// of their highest voltages, rounded to 0.05 V.
 fn cycle_limits(files: &[MeasuredFile], first: usize) -> Option<(Limit<'_>, Limit<'_>)> {
     let (mut ends, mut tops) = (Vec::new(), Vec::new());
@@ -132,7 +125,7 @@ fn cycle_limits(files: &[MeasuredFile], first: usize) -> Option<(Limit<'_>, Limi
     for list in [&mut ends, &mut tops] {
         list.sort_by(|a, b| a.voltage_v.total_cmp(&b.voltage_v));
     }
-    // If a discharge does not fall below this voltage (V), it was aborted.
+    // A discharge that ends above this voltage (V) was aborted.
     let broken_off_v = ends.get(ends.len() / 2)?.voltage_v + 0.3;
     let low = *ends.iter().rfind(|end| end.voltage_v < broken_off_v)?;
     let high = tops.get(tops.len() / 2).copied();
@@ -141,8 +134,8 @@ fn cycle_limits(files: &[MeasuredFile], first: usize) -> Option<(Limit<'_>, Limi
     Some(((cut_off_v, low), ((high.voltage_v * 20.0).round() / 20.0, high)))
 }
 
-/// Returns the row under load with the lowest voltage of a discharge (`sign` = 1) or the highest voltage of a charge
-/// (`sign` = -1).
+/// Returns the row under load with the lowest voltage of a discharge (`sign` = 1) or the highest of a charge (`sign` =
+/// -1).
 fn extreme(part: &MeasuredPart, sign: f64) -> Option<usize> {
     let most_a = part.current_a.iter().fold(0.0_f64, |most, i| most.max(i * sign));
     let loaded = (0..part.len()).filter(|&k| part.current_a[k] * sign > REST_SHARE * most_a);

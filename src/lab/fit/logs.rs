@@ -1,11 +1,10 @@
 //! Fits a cell model to logs of a whole pack: ordinary drives and charges that start at any SOC.
 //!
-//! Input: a configuration with a cell model or a label, and logs as the daemon reads them. Output: a [`FitOutcome`].
 //! Where the logs contain no information, the tables stay as in the configured model.
 //!
 //! Every log is replayed through the monitor, so limits, decoding and fault handling are the same as in the daemon.
-//! Only cells of the configured kind are used, and their mean voltage is fitted like the voltage of a single cell. A
-//! stretch is a part of a log without gaps. The SOC at the start of each stretch is an additional unknown.
+//! Only cells of the configured kind are used. Their mean voltage is fitted like the voltage of a single cell. A
+//! stretch is a part of a log without gaps. Its initial SOC is an additional unknown.
 
 use std::cell::RefCell;
 use std::path::{Path, PathBuf};
@@ -39,39 +38,37 @@ use crate::replay::{self, OutputWatch, ReplaySettings, Sinks};
 
 /// A stretch with fewer rows is not used.
 const LEAST_ROWS: usize = 20;
-/// Standard deviation that is added (as a root sum of squares) to the uncertainty of the estimated SOC at the start of
-/// a stretch.
+/// Standard deviation (SOC) that is added to the uncertainty of a stretch's initial SOC, as a root sum of squares.
 const BEGINNING_STD: f64 = 0.02;
 /// A stretch starts full if its open-circuit voltage is at least the OCV at this SOC.
 const FULL_SOC: f64 = 0.975;
-/// The open-circuit voltage at the start is computed with this share of the model's series resistance. No cell has a
-/// smaller resistance.
+/// Smallest series resistance of a real cell, as a share of the model's resistance. It gives the open-circuit voltage
+/// at the start of a stretch.
 const LEAST_RESISTANCE: f64 = 0.4;
 /// Standard deviation of the initial SOC of a stretch that starts full.
 const FULL_STD: f64 = 0.01;
-/// Below an SOC of this value times (Arrhenius factor - 1), a cold cell is limited by diffusion. A circuit model does
-/// not describe the voltage there, so the voltage error would be mistaken for lost capacity. Chosen on Panasonic
-/// 18650PF cells.
+/// Diffusion limits a cold cell below an SOC of this value times (Arrhenius factor - 1). A circuit model does not
+/// describe the voltage there, and this voltage error would be mistaken for lost capacity. The value was chosen on
+/// Panasonic 18650PF cells.
 const KNEE_SOC: f64 = 0.13;
 /// Upper limit of [`KNEE_SOC`] times (Arrhenius factor - 1).
 const MOST_KNEE_SOC: f64 = 0.35;
-/// A cold cell does not settle within a drive. The error of its voltage corresponds to an SOC error of this value times
-/// (Arrhenius factor - 1). Rests of 20 min of Panasonic 18650PF cells at 10 to -20 degrees C show 0.013 to 0.024; rests
-/// during drives are shorter.
+/// SOC error of a cold cell divided by (Arrhenius factor - 1). The error arises because the voltage of a cold cell does
+/// not settle within a drive. After rests of 20 min at 10 to -20 degrees C, the value is 0.013 to 0.024 for Panasonic
+/// 18650PF cells. Rests during drives are shorter, so the error is larger.
 const COLD_SOC: f64 = 0.03;
-/// Residual (V), above which the logs cannot come from a single kind of cell. In the cold, the limit is multiplied by a
-/// power of the Arrhenius factor. Fits of the cells of `tests/label` leave residuals of 5 to 20 mV when warm and 27 mV
-/// at 0 degrees C.
+/// Residual (V) above which the logs cannot come from a single kind of cell. In the cold, it is multiplied by a power
+/// of the Arrhenius factor. Fits of the cells of `tests/label` leave 5 to 20 mV when warm and 27 mV at 0 degrees C.
 const UNFIT_V: f64 = 0.04;
-/// A charge is complete if the voltage is within [`HELD_V`] (V) of the maximum voltage, and the remaining current would
-/// need more than [`FADED_H`] (h) to charge the rated capacity.
+/// A charge is complete only if the voltage is within this distance of the maximum voltage (V).
 const HELD_V: f64 = 0.012;
+/// A charge is complete only if charging the rated capacity with the remaining current would take longer than this (h).
 const FADED_H: f64 = 15.0;
-/// Smallest assumed error of the configured model's open-circuit curve (V). The first value applies to errors that vary
-/// smoothly over [`CURVE_SOC`], the second to independent errors of the breakpoints.
+/// Smallest assumed error of the configured model's open-circuit curve (V): first the part that varies smoothly over
+/// [`CURVE_SOC`], then the independent error of each breakpoint.
 const CURVE_V: (f64, f64) = (0.004, 0.002);
+/// Correlation length of the smooth part, SOC.
 const CURVE_SOC: f64 = 0.1;
-/// SOC breakpoints of the fitted tables.
 const SOC: [f64; 26] = [
     0.0, 0.02, 0.05, 0.075, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85,
     0.9, 0.93, 0.96, 0.98, 0.99, 1.0,
@@ -83,7 +80,7 @@ pub struct LogRequest<'a> {
     pub monitor: &'a MonitorConfig,
     /// Names of the interfaces.
     pub interfaces: Vec<String>,
-    /// Longest gap in a log (s) before the recorder counts as asleep.
+    /// A gap in a log longer than this (s) means that the recorder was asleep.
     pub sleep_gap_s: f64,
     /// Creates the options for reading one log.
     pub options: &'a (dyn Fn() -> LogOptions + Sync),
@@ -91,17 +88,15 @@ pub struct LogRequest<'a> {
     pub logs: Vec<PathBuf>,
 }
 
-/// Mean of all cells over a part of a log that has no gap.
 #[derive(Debug, Clone, Default)]
 struct Stretch {
     log: usize,
     part: MeasuredPart,
     cells: CellDistances,
-    /// SOC that the estimator found at the first row, with its standard deviation.
+    /// Initial SOC from the estimator, with its standard deviation.
     beginning: (f64, f64),
 }
 
-/// Averages the readings of a pack's cells.
 #[derive(Debug, Default)]
 struct MeanCell {
     stretches: Vec<Stretch>,
@@ -109,7 +104,6 @@ struct MeanCell {
     voltage_v: Vec<f64>,
     count: f64,
     sums: [f64; 6],
-    /// Whether the next reading starts a new stretch.
     begins: bool,
 }
 
@@ -155,7 +149,7 @@ impl MeanCell {
             return;
         }
         let last_s = self.stretches.last().and_then(|stretch| stretch.part.time_s.last().copied());
-        // Longest gap within a stretch (s). It is longer than the interval of any logger, and shorter than a stop.
+        // Longest gap within a stretch (s): longer than the interval of any logger, shorter than a stop.
         let has_hole = last_s.is_none_or(|last_s| time_s - last_s > 120.0 || time_s < last_s);
         if std::mem::take(&mut self.begins) || has_hole {
             let beginning = (soc, soc_std.hypot(BEGINNING_STD));
@@ -206,7 +200,7 @@ fn fit_stretches(
     let known = known(model, &grid, request.monitor);
     let fit = unanchored::fit(&settings, &known, &records, |pass, cost| progress(FitProgress::Pass(pass, cost)))
         .map_err(LabError::Data)?;
-    // If the logs come from two packs or from cells of an unknown kind, the fit is not valid, so the prior is used.
+    // With a large residual, the logs come from two packs or from cells of an unknown kind. The prior is then used.
     let unfit_v = Some(fit.fitted.total.rmse_v).filter(|rmse_v| *rmse_v > unfit_v(&grid));
     let fit =
         if unfit_v.is_some() { unanchored::prior(&settings, &known, &records).map_err(LabError::Data)? } else { fit };
@@ -249,7 +243,6 @@ fn fit_stretches(
     Ok(outcome)
 }
 
-/// Returns notes on the capacity, on information that is missing in the logs, and on the chemistry.
 fn notes(model: &CellModel, stretches: &[Stretch], fit: &UnanchoredFit, known: &Known) -> Vec<String> {
     let (capacity_ah, std_ah) = (fit.capacity_ah, fit.capacity_std_ah);
     let mut notes = vec![format!(
@@ -268,18 +261,15 @@ fn notes(model: &CellModel, stretches: &[Stretch], fit: &UnanchoredFit, known: &
     notes
 }
 
-/// Returns the residual (V), above which the logs do not come from one kind of cell.
 fn unfit_v(grid: &Grid) -> f64 {
     UNFIT_V * error_ratio(grid)
 }
 
-/// Returns the error of the circuit model at the coldest node, relative to its error when warm.
 fn error_ratio(grid: &Grid) -> f64 {
     let coldest_c = grid.temperature_c.first().copied().unwrap_or(ELECTRODES_C);
     libm::pow(1.0 + colder(coldest_c), COLD_POWER)
 }
 
-/// Returns the voltage error of a cold cell that has not settled (V), in node order.
 fn unsettled_v(fitted: &FittedTables) -> Vec<f64> {
     let (soc, columns) = (&fitted.grid.soc, fitted.grid.soc.len());
     let of_node = |node: usize| {
@@ -297,11 +287,10 @@ fn colder(temperature_c: f64) -> f64 {
     (arrhenius(temperature_c) - 1.0).max(0.0)
 }
 
-/// Returns the stretches of one log.
 fn stretches(request: &LogRequest<'_>, log: usize, path: &Path) -> Result<Vec<Stretch>, LabError> {
     let mean = Rc::new(RefCell::new(MeanCell::new(usize::from(request.monitor.sample.cells))));
     let watched = Rc::clone(&mean);
-    // Cells in modules of another kind have another open-circuit curve, so they are left out.
+    // Other kinds of cells have another open-circuit curve.
     let is_own: Vec<bool> =
         (0..request.monitor.sample.cells).map(|cell| request.monitor.is_own(CellIndex(cell))).collect();
     let watch: OutputWatch = Box::new(move |record, out| {
@@ -314,8 +303,7 @@ fn stretches(request: &LogRequest<'_>, log: usize, path: &Path) -> Result<Vec<St
     let sinks = Sinks { watch: Some(watch), ..Sinks::default() };
     let mut source = LogSource::new([path.to_owned()], (request.options)());
     let settings = ReplaySettings::plain(request.sleep_gap_s, request.interfaces.clone());
-    // Without a label, the monitor does not learn a model, so the model from which the fit starts stays the same during
-    // the replay.
+    // Without a label, the monitor learns no model, so the initial model stays the same during the replay.
     let monitor = Monitor::new(MonitorConfig { label: None, ..request.monitor.clone() });
     replay::run(&mut source, monitor, sinks, settings, &mut |_| ())
         .map_err(|error| LabError::Data(error.to_string()))?;
@@ -325,7 +313,7 @@ fn stretches(request: &LogRequest<'_>, log: usize, path: &Path) -> Result<Vec<St
     Ok(stretches.into_iter().map(|stretch| Stretch { log, ..stretch }).collect())
 }
 
-/// Converts a stretch to rows of the fit. The `soc` of a row is minus the charge taken out since the first row (Ah).
+/// Converts a stretch to rows of the fit. `soc` is minus the charge taken out since the first row (Ah).
 fn unanchored(stretch: &Stretch, grid: &Grid, model: &CellModel) -> UnanchoredRecord {
     let mut part = stretch.part.clone();
     let first_s = part.time_s[0];
@@ -345,15 +333,15 @@ fn unanchored(stretch: &Stretch, grid: &Grid, model: &CellModel) -> UnanchoredRe
     UnanchoredRecord { record, scale, beginning, full }
 }
 
-/// Whether a stretch starts with a full cell: even with the smallest possible resistance, its open-circuit voltage
-/// reaches the voltage of a full cell.
+/// Whether a stretch starts with a full cell: the open-circuit voltage reaches that of a full cell even with the
+/// smallest resistance.
 fn begins_full(part: &MeasuredPart, model: &CellModel) -> bool {
     let (voltage_v, current_a, temperature_c) = (part.voltage_v[0], part.current_a[0], part.temperature_c[0]);
     let drop_v = LEAST_RESISTANCE * model.r0_ohm(&model.grid_position(1.0, temperature_c)) * current_a;
     voltage_v + drop_v >= model.ocv_v(&model.grid_position(FULL_SOC, temperature_c))
 }
 
-/// Returns the voltage (V), below which rows of a cold cell are not judged.
+/// Returns the voltage (V) below which diffusion limits a cold cell. Rows below it do not count in the fit.
 fn knee_v(model: &CellModel, current_a: f64, temperature_c: f64) -> f64 {
     let soc = (KNEE_SOC * colder(temperature_c)).min(MOST_KNEE_SOC);
     if soc <= 0.0 {
@@ -363,8 +351,7 @@ fn knee_v(model: &CellModel, current_a: f64, temperature_c: f64) -> f64 {
     model.ocv_v(&position) - model.settled_ohm(&position) * current_a.max(0.0)
 }
 
-/// Finds the last row at which a charge is complete: the voltage is at its highest and the current has faded. Returns
-/// the charge taken out (Ah) and the time (h) of this row.
+/// Returns the charge taken out (Ah) and the time (h) of the last row at which a charge is complete.
 fn full(part: &MeasuredPart, model: &CellModel) -> Option<(f64, f64)> {
     let most_a = model.rated_capacity_ah / FADED_H;
     let is_full = |&k: &usize| {
@@ -373,18 +360,15 @@ fn full(part: &MeasuredPart, model: &CellModel) -> Option<(f64, f64)> {
     (0..part.len()).rev().find(is_full).map(|k| (-part.soc[k], part.time_s[k] / 3600.0))
 }
 
-/// Returns one node per group of similar temperatures. Stretches without a measured temperature have the ambient
-/// temperature.
 fn temperature_nodes(stretches: &[Stretch]) -> Vec<f64> {
     let of_stretch = |stretch: &Stretch| median(stretch.part.temperature_c.iter().copied());
     let mut medians: Vec<f64> = stretches.iter().filter_map(of_stretch).collect();
     medians.sort_by(f64::total_cmp);
-    // Stretches share a node if their temperatures differ by less than this (K).
+    // Stretches within 5 K share a node.
     let groups = medians.chunk_by(|a, b| b - a < 5.0);
     groups.map(|group| (10.0 * group.iter().sum::<f64>() / group.len() as f64).round() / 10.0).collect()
 }
 
-/// Returns the prior knowledge from the configured model.
 fn known(model: &CellModel, grid: &Grid, monitor: &MonitorConfig) -> Known {
     let per_node = |value: &dyn Fn(f64, f64) -> f64| -> Vec<f64> {
         grid.temperature_c
@@ -419,8 +403,7 @@ fn known(model: &CellModel, grid: &Grid, monitor: &MonitorConfig) -> Known {
         curve_row,
         capacity_ah: initial.capacity_ah,
         capacity_std: initial.capacity_std_ah / initial.capacity_ah,
-        // Smallest standard deviation of the current sensor's offset: the current that discharges the rated capacity in
-        // this time (h).
+        // The standard deviation of the offset is at least C/1000 (a current that takes 1000 h for the rated capacity).
         offset_std_a: monitor.estimator.sensor.current_offset_a.max(model.rated_capacity_ah / 1000.0),
     }
 }

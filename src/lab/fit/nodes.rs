@@ -1,23 +1,21 @@
 //! Places SOC breakpoints where the open-circuit curve of the slow tests bends.
 //!
-//! Input: slow tests (SOC, V). Output: breakpoints, fraction. A model is linear between breakpoints, which causes an
-//! SOC error. A breakpoint is added where this error is largest, until the error is below [`MOST_POINTS`] everywhere or
-//! there are [`MOST_NODES`] breakpoints.
+//! Linear interpolation between breakpoints causes an SOC error. Breakpoints are added where the error is largest,
+//! until it is below [`MOST_POINTS`] everywhere or there are [`MOST_NODES`] breakpoints.
 
 use crate::ident::fit::{MIN_SLOPE_V, OcvCurve};
 use crate::ident::grid::interpolate;
 
 /// Maximum SOC error of the linear interpolation, fraction.
 const MOST_POINTS: f64 = 0.005;
-/// Width over which the slope is computed, SOC. The width spans the steps of a plateau, because a changing SOC estimate
-/// crosses them.
+/// Width over which the slope is computed, SOC. It is wider than the steps in a plateau, because a changing SOC
+/// estimate crosses these steps.
 const SLOPE_WIDTH: f64 = 0.04;
 /// Smallest distance between breakpoints, and between the SOC values at which the error is computed.
 const LEAST_DISTANCE: f64 = 0.01;
-/// Maximum number of breakpoints; more would make a fit slow.
+/// Maximum number of breakpoints. More would make a fit slow.
 const MOST_NODES: usize = 31;
 
-/// Adds nodes to `first` where the curves bend.
 pub(super) fn by_curvature(first: &[f64], curves: &[OcvCurve]) -> Vec<f64> {
     let mut nodes = first.to_vec();
     while nodes.len() < MOST_NODES {
@@ -31,14 +29,14 @@ pub(super) fn by_curvature(first: &[f64], curves: &[OcvCurve]) -> Vec<f64> {
     nodes
 }
 
-/// Returns the SOC error (fraction) that linear interpolation between `nodes` causes at the SOC `at`: the largest error
-/// of all curves.
+/// Returns the SOC error (fraction) of linear interpolation between `nodes` at the SOC `at`: the largest over all
+/// curves.
 fn misread(curves: &[OcvCurve], nodes: &[f64], at: f64) -> f64 {
     let of_curve = |curve: &OcvCurve| {
         let voltage_v = |soc: f64| interpolate(&curve.soc, &curve.voltage_v, soc);
         let above = nodes.partition_point(|&node| node < at);
         let (low, high) = (nodes[above - 1], nodes[above]);
-        // A test in the cold contains no information below the SOC at which it ended.
+        // A cold test ends before the cell is empty, so its curve does not reach SOC 0.
         if low < curve.soc[0] {
             return 0.0;
         }
@@ -46,7 +44,7 @@ fn misread(curves: &[OcvCurve], nodes: &[f64], at: f64) -> f64 {
         let error_v = (voltage_v(low) + along * (voltage_v(high) - voltage_v(low)) - voltage_v(at)).abs();
         let (from, to) = ((at - 0.5 * SLOPE_WIDTH).max(0.0), (at + 0.5 * SLOPE_WIDTH).min(1.0));
         let slope_v = ((voltage_v(to) - voltage_v(from)) / (to - from)).max(MIN_SLOPE_V);
-        // A node is added only above this voltage error (V). No model is more accurate.
+        // Errors up to 1 mV are ignored, because no model is more accurate.
         if error_v > 0.001 { error_v / slope_v } else { 0.0 }
     };
     curves.iter().map(of_curve).fold(0.0, f64::max)
@@ -56,7 +54,7 @@ fn misread(curves: &[OcvCurve], nodes: &[f64], at: f64) -> f64 {
 mod tests {
     use super::*;
 
-    /// A straight curve with a step of 50 mV at SOC 0.63.
+    /// Creates a straight curve with a step of 50 mV at SOC 0.63.
     fn stepped() -> OcvCurve {
         let soc: Vec<f64> = (0..=1000).map(|k| f64::from(k) / 1000.0).collect();
         let voltage_v = soc.iter().map(|z| 3.0 + z + 0.025 * ((z - 0.63) / 0.01).tanh()).collect();

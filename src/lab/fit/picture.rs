@@ -1,4 +1,4 @@
-//! Plots the residuals: one panel per file with the measured voltage minus the model's voltage over time.
+//! Plots the residuals (measured voltage minus the model's voltage) over time, with one panel per file.
 
 use std::path::Path;
 
@@ -12,7 +12,7 @@ use crate::ident::pass::residuals;
 /// # Errors
 /// The file cannot be written.
 pub fn write(path: &Path, outcome: &FitOutcome) -> Result<(), LabError> {
-    // Maximum number of panels: a reader cannot use more.
+    // More than 40 panels are not readable.
     let panels: Vec<Picture> = (0..outcome.files.len()).take(40).map(|number| panel(outcome, number)).collect();
     Ok(chart::write_stack(path, &panels)?)
 }

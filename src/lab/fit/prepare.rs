@@ -1,4 +1,4 @@
-//! Converts measured files to records for the fit: determines voltage limits, capacity and temperatures, evaluates slow
+//! Converts measured files to records for the fit. Determines voltage limits, capacity and temperatures, evaluates slow
 //! tests, and assigns an SOC to every row.
 
 use super::FitRequest;
@@ -10,24 +10,21 @@ use crate::ident::grid::Grid;
 use crate::ident::record::{self, Limits, Record};
 use crate::measured::{MeasuredFile, MeasuredPart};
 
-/// A voltage is credible if it is at most this far below the lowest voltage of the cell (first value, V) and at most
-/// this far above the highest voltage (second value, V).
+/// A credible voltage lies at most this far below the lowest voltage of the cell (first value, V) and above the highest
+/// (second value, V).
 pub(super) const CREDIBLE_BEYOND_V: (f64, f64) = (1.0, 0.3);
-/// Weight of a charge of an ageing cell relative to a discharge. It is smaller because the voltage of a charge contains
-/// slower relaxation.
+/// Weight of an ageing cell's charge relative to a discharge. It is smaller because relaxation is slower during charge.
 const AGEING_CHARGE_SCALE: f64 = 0.6;
 
-/// A part of a file with the SOC of its rows, before the rows have positions in the grid.
+/// A part of a file with the SOC of its rows, not yet placed in the grid.
 pub(super) struct AnchoredPart {
-    /// Number of the file.
     pub(super) file: usize,
     part: MeasuredPart,
     judged: Vec<bool>,
-    /// Weight of each second of the part; `None` = computed from the covered SOC and the kind of test.
+    /// Weight of each second of the part; `None` = computed from the covered SOC range and the kind of test.
     scale: Option<f64>,
 }
 
-/// Inputs of the fit that do not depend on the grid.
 pub(super) struct FitInputs {
     pub(super) sources: Vec<AnchoredPart>,
     pub(super) capacity_ah: f64,
@@ -36,11 +33,11 @@ pub(super) struct FitInputs {
     pub(super) notes: Vec<String>,
 }
 
-/// Removes rows without current or voltage, and rows whose time runs backwards. If a temperature is missing, the
-/// previous temperature is used; at the start of the part, the first known temperature.
+/// Removes rows without current or voltage, and rows whose time runs backwards. A missing temperature gets the previous
+/// value or, at the start, the first known value.
 fn clean(part: &MeasuredPart) -> MeasuredPart {
     let known = part.temperature_c.iter().copied().find(|t| t.is_finite());
-    // Assumed temperature of a file without temperatures, degrees Celsius.
+    // Assumed for a file without temperatures (degrees Celsius).
     let mut temperature_c = known.unwrap_or(25.0);
     let mut clean = MeasuredPart { key: part.key.clone(), kind: part.kind.clone(), ..MeasuredPart::default() };
     for k in 0..part.len() {
@@ -56,7 +53,6 @@ fn clean(part: &MeasuredPart) -> MeasuredPart {
     clean
 }
 
-/// Determines all inputs that do not depend on the grid.
 pub(super) fn prepare(
     request: &FitRequest,
     files: &[MeasuredFile],
@@ -104,11 +100,10 @@ pub(super) fn prepare(
     Ok(FitInputs { sources, capacity_ah, voltage_v, ocv, notes })
 }
 
-/// Number of the file, a part of it, and for every row the charge taken out since the cell was full (Ah).
+/// File number, part, and for every row the charge taken out since the cell was full (Ah).
 type PartDischarge = (usize, MeasuredPart, Vec<f64>);
 
-/// Returns the charge taken out for every part of every file. If parts do not start with a full cell, a single error
-/// lists all of them.
+/// Returns the charge taken out for every part. One error lists all parts that do not start with a full cell.
 fn taken_out(request: &FitRequest, files: &[MeasuredFile], voltage_max_v: f64) -> Result<Vec<PartDischarge>, LabError> {
     let (mut taken, mut refused) = (Vec::new(), Vec::new());
     for (number, file) in files.iter().enumerate() {
@@ -132,10 +127,8 @@ fn rough_capacity(part: &MeasuredPart) -> f64 {
     out.iter().fold(0.0_f64, |most, ah| most.max(*ah))
 }
 
-/// The discharge of a slow test.
 struct SlowDischarge {
     temperature_c: f64,
-    /// Charge taken out (Ah), rising.
     out_ah: Vec<f64>,
     voltage_v: Vec<f64>,
 }
@@ -167,7 +160,6 @@ fn slow_test(file: &MeasuredFile, voltage_max_v: f64) -> Result<SlowDischarge, L
         }
     }
     let whole_ah = out_ah.iter().fold(0.0_f64, |most, ah| most.max(*ah));
-    // The first discharge must take out at least this share of the largest charge taken out in the file.
     if test.out_ah.len() < 10 || test.out_ah[test.out_ah.len() - 1] < 0.5 * whole_ah {
         return Err(fail(format!("its first discharge has {} rows, expected a whole slow one", test.out_ah.len())));
     }
@@ -175,7 +167,6 @@ fn slow_test(file: &MeasuredFile, voltage_max_v: f64) -> Result<SlowDischarge, L
     Ok(test)
 }
 
-/// Converts a slow test to data of the fit.
 fn slow_source(
     file: &MeasuredFile,
     number: usize,
@@ -186,7 +177,6 @@ fn slow_source(
     let out_ah = part.taken_out_ah(voltage_max_v, capacity_ah);
     let out_ah = out_ah.map_err(|e| LabError::Data(format!("{}: {e}", file.path.display())))?;
     let most = out_ah.iter().enumerate().fold(0, |most, (k, ah)| if *ah > out_ah[most] { k } else { most });
-    // Rows after the end of the discharge are not judged.
     let judged = (0..out_ah.len()).map(|k| k <= most).collect();
     part.soc = out_ah.iter().map(|ah| 1.0 - ah / capacity_ah).collect();
     Ok(AnchoredPart { file: number, part, judged, scale: None })
@@ -229,7 +219,6 @@ fn ageing_sources(
 }
 
 impl FitInputs {
-    /// Returns the records with their positions in `grid`, and the weight of each record.
     pub(super) fn records(&self, grid: &Grid) -> (Vec<Record>, Vec<f64>) {
         let limits = Limits {
             voltage_low_v: (self.voltage_v.0 - CREDIBLE_BEYOND_V.0).max(DISCONNECTED_V),
@@ -238,7 +227,7 @@ impl FitInputs {
         };
         let record = |source: &AnchoredPart| Record::prepare(&source.part, &source.judged, grid, &limits);
         let records: Vec<Record> = self.sources.iter().map(record).collect();
-        // If the data contain no drive, slow tests and pulse tests have full weight.
+        // Division by the largest share gives slow tests and pulse tests full weight if there is no drive.
         let most = records.iter().map(record::share).fold(0.0, f64::max);
         let by_share = |r: &Record| record::weight(r) * record::share(r) / most;
         let scale = self.sources.iter().zip(&records).map(|(s, r)| s.scale.unwrap_or_else(|| by_share(r)));
@@ -246,7 +235,6 @@ impl FitInputs {
         (records, scale)
     }
 
-    /// Returns the residuals of the discharges and of the charges.
     pub(super) fn by_kind(&self, records: &[Record], fitted: &FittedTables) -> (Residual, Residual) {
         let of_kind = |discharge: bool| {
             let own = self.sources.iter().zip(records).filter(|(s, _)| s.part.is_discharge() == discharge);
@@ -256,8 +244,8 @@ impl FitInputs {
         (of_kind(true), of_kind(false))
     }
 
-    /// Returns the temperatures of the parts; similar temperatures are averaged. The temperature of a part is the lower
-    /// decile of its rows, because cells warm up under load.
+    /// Returns the temperatures of the parts; similar temperatures are averaged. Cells warm up under load, so the
+    /// lowest decile of a part's rows counts.
     pub(super) fn temperature_nodes(&self) -> Vec<f64> {
         let coldest = |source: &AnchoredPart| {
             let mut seen = source.part.temperature_c.clone();
@@ -270,7 +258,7 @@ impl FitInputs {
         let mut last = f64::NEG_INFINITY;
         for t in all {
             match nodes.last_mut() {
-                // Parts share a node if their temperatures differ by less than this (K).
+                // Parts within 5 K share a node.
                 Some((sum, count)) if t - last < 5.0 => (*sum, *count) = (*sum + t, *count + 1.0),
                 _ => nodes.push((t, 1.0)),
             }

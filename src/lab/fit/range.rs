@@ -1,11 +1,9 @@
 //! Determines the measured range of a model, and extends the model's tables beyond the measured temperatures.
 //!
-//! Input: the records of a fit, and the fitted tables. Output: the measured ranges of temperature (degrees Celsius),
-//! current (A) and SOC, and extended tables. The extended tables have an additional row [`REACH_K`] below the lowest
-//! measured temperature, and another above the highest. If the nodes do not reach an end of the measured temperatures,
-//! that end also gets a row. In the added rows, the open-circuit curve and the time constants repeat the nearest
-//! measured row, and the resistances follow Arrhenius' law. Arrhenius' law is only approximate, so the voltage error
-//! grows with the distance.
+//! Ranges are given for temperature (degrees Celsius), current (A) and SOC. A row is added [`REACH_K`] beyond each end
+//! of the measured temperatures. If the nodes do not reach an end, a row is also added at this end. Added rows repeat
+//! the open-circuit curve and the time constants of the nearest fitted row. Their resistances follow Arrhenius' law.
+//! The law is only approximate, so the voltage error grows with the distance.
 
 use crate::cell::arrhenius;
 use crate::filter::ends;
@@ -17,13 +15,11 @@ use crate::ident::record::Record;
 
 /// Distance of an additional row from the measured temperatures (K).
 const REACH_K: f64 = 40.0;
-/// Standard deviation of the activation energy of a cell's resistances, J/mol. The energy is assumed to be uniformly
+/// Standard deviation of the activation energy of a cell's resistances (J/mol). The energy is assumed to be uniformly
 /// distributed from 15 to 35 kJ/mol.
 const ENERGY_STD_J_PER_MOL: f64 = 6_000.0;
-/// 0 degrees Celsius in K.
 const ZERO_CELSIUS_K: f64 = 273.15;
-/// Share of the time that is ignored at either end of the temperature range, because sensors settle and have stray
-/// values.
+/// Share of the time that is ignored at each end of the temperature range, because sensors have outliers.
 const STRAY: f64 = 0.005;
 
 /// Ranges of a fit's data.
@@ -40,7 +36,6 @@ pub struct MeasuredRange {
 }
 
 impl MeasuredRange {
-    /// Returns the ranges of the judged rows.
     pub(super) fn of(records: &[Record]) -> Self {
         let rows = || records.iter().flat_map(|record| &record.rows).filter(|row| row.weight_s > 0.0);
         let mut by_temperature: Vec<(f64, f64)> = rows().map(|row| (row.temperature_c, row.weight_s)).collect();
@@ -61,24 +56,22 @@ impl MeasuredRange {
     }
 }
 
-/// A model's tables in node order.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct ModelTables {
     pub(super) grid: Grid,
     pub(super) tables: ParameterTables,
-    /// Standard deviation of the voltage error, averaged over 100 s, V.
+    /// Standard deviation of the model's voltage error, averaged over 100 s (V).
     pub(super) voltage_error_v: Vec<f64>,
 }
 
 impl ModelTables {
-    /// Returns the fitted tables without additional rows.
     pub(super) fn fitted(fitted: &FittedTables, voltage_error_v: &[f64]) -> Self {
         let (grid, tables) = (fitted.grid.clone(), fitted.tables.clone());
         Self { grid, tables, voltage_error_v: voltage_error_v.to_vec() }
     }
 
-    /// Returns the fitted tables with rows outside the measured temperatures. If `is_scaled` is set, Arrhenius' law
-    /// applies from the first and last node on; otherwise, from the ends of the measured temperatures on.
+    /// Adds rows outside the measured temperatures. If `is_scaled` is set, the resistances of the first and last node
+    /// apply at the temperature of the node. Otherwise, they apply at the end of the measured temperatures.
     pub(super) fn beyond(
         fitted: &FittedTables,
         voltage_error_v: &[f64],
@@ -113,8 +106,8 @@ impl ModelTables {
         all
     }
 
-    /// Adds a row for the temperature `to_c`: the fitted row `row`, valid at `from_c`, with its resistances scaled by
-    /// Arrhenius' law.
+    /// Adds the row for `to_c`: the fitted row `row` with its resistances scaled by Arrhenius' law from `from_c` to
+    /// `to_c`.
     fn add_row(
         &mut self,
         (fitted, voltage_error_v): (&FittedTables, &[f64]),
@@ -125,7 +118,7 @@ impl ModelTables {
         let nodes = row * columns..(row + 1) * columns;
         let factor = arrhenius(to_c) / arrhenius(from_c);
         let per_kelvin = 1.0 / (to_c + ZERO_CELSIUS_K) - 1.0 / (from_c + ZERO_CELSIUS_K);
-        // Gas constant, J/(mol K).
+        // 8.314 J/(mol K) is the gas constant.
         let log_std = (ENERGY_STD_J_PER_MOL / 8.314_462_618 * per_kelvin).abs();
         self.grid.temperature_c.push(to_c);
         let ParameterTables { ocv_v, r0_ohm, r_ohm, tau_s } = &fitted.tables;
@@ -137,12 +130,12 @@ impl ModelTables {
             to_r.extend(r[nodes.clone()].iter().map(|ohm| ohm * factor));
             to_tau.extend(&tau[nodes.clone()]);
         }
-        // At a higher temperature, a model is not more accurate than measured.
+        // The error of a warmer cell is not reduced.
         let colder = factor.max(1.0);
         self.voltage_error_v.extend(nodes.map(|node| {
             let settled_ohm = r_ohm.iter().fold(r0_ohm[node], |sum, r| sum + r[node]);
             let arrhenius_v = log_std * rms_a * settled_ohm * colder;
-            // Upper limit of the errors (V): with such an error, the voltage hardly affects an estimate.
+            // The error is at most 0.5 V, because with this error, a voltage hardly affects an estimate.
             libm::hypot(voltage_error_v[node] * libm::pow(colder, COLD_POWER), arrhenius_v).min(0.5)
         }));
     }

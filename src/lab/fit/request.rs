@@ -1,7 +1,6 @@
-//! Defines and checks the request for a fit, which the command line and the Python module make.
+//! Defines and checks the arguments of a fit for the command line and the Python module.
 //!
-//! Input: files, and known data of the cell. Output: a checked request. Only [`FitRequest::check`] defines the allowed
-//! ranges. Errors name the argument of the command.
+//! Only [`FitRequest::check`] defines the allowed ranges. Errors name the command-line argument.
 
 use std::path::PathBuf;
 
@@ -10,7 +9,7 @@ use crate::error::{LabError, check_values as check};
 use crate::io::csv_log::CsvOptions;
 use crate::quantity::bounds;
 
-/// Maximum number of SOC breakpoints: one per percent. The duration of a fit grows with the cube of their number.
+/// Maximum number of SOC breakpoints: one per percent. The duration of a fit grows with the cube of this number.
 pub const MAX_SOC_NODES: usize = 101;
 
 /// Arguments of a fit.
@@ -18,8 +17,8 @@ pub const MAX_SOC_NODES: usize = 101;
 pub struct FitRequest {
     /// Name of the cell.
     pub name: String,
-    /// Capacity that defines the SOC (Ah); `None` = the capacity of the slow test or of the deepest discharge; for an
-    /// ageing cell, the mean capacity of the discharges.
+    /// Capacity that defines the SOC (Ah). `None` = the capacity of the slow test or of the deepest discharge. For an
+    /// ageing cell, `None` = the mean capacity of the discharges.
     pub capacity_ah: Option<f64>,
     /// Capacity on the label (Ah); `None` = `capacity_ah`.
     pub rated_ah: Option<f64>,
@@ -40,10 +39,10 @@ pub struct FitRequest {
     pub temperature_c: Option<Vec<f64>>,
     /// SOC breakpoints, rising from 0 to 1; `None` = the defaults.
     pub soc: Option<Vec<f64>>,
-    /// For an ageing cell: only the parts whose number in the column `cycle` is at most this number are used; `ocv` and
-    /// `capacity_ah` must then be empty. `None` = the cell is not ageing.
+    /// For an ageing cell: highest number in the column `cycle` that is used. `ocv` and `capacity_ah` must then be
+    /// empty. `None` = the cell is not ageing.
     pub first_cycles: Option<usize>,
-    /// Columns and sign of the files, if their headers do not say it.
+    /// Columns and current sign of the files, if their headers do not state them.
     pub table: CsvOptions,
     /// Files to fit; at least one.
     pub files: Vec<PathBuf>,
@@ -53,8 +52,7 @@ impl FitRequest {
     /// Checks the range of every argument, and that the arguments are compatible.
     ///
     /// # Errors
-    /// An argument is out of its range, or two arguments are not compatible. The error names the first such argument,
-    /// what was found and what is allowed.
+    /// An argument is out of its range, or two arguments are not compatible.
     pub fn check(&self) -> Result<(), LabError> {
         if self.files.is_empty() {
             return Err("no files, must be one or more".into());
@@ -109,7 +107,7 @@ impl FitRequest {
     fn check_nodes(&self) -> Result<(), LabError> {
         if let Some(temperatures_c) = &self.temperature_c {
             let allowed = bounds::TEMPERATURE_C;
-            // Maximum number of temperature breakpoints. Data never have more.
+            // No data set has more than 32 temperatures.
             check_list("--temperatures", temperatures_c, 1..=32)?;
             check("--temperatures", temperatures_c.iter().copied(), |found| allowed.has(found), allowed.allowed)?;
         }
@@ -124,13 +122,12 @@ fn is_above_0(value: f64) -> bool {
     value.is_finite() && value > 0.0
 }
 
-/// Rejects a list that has the wrong length or does not rise.
 fn check_list(key: &str, list: &[f64], allowed: std::ops::RangeInclusive<usize>) -> Result<(), LabError> {
     if !allowed.contains(&list.len()) {
         let (found, least, most) = (list.len(), allowed.start(), allowed.end());
         return Err(LabError::Data(format!("{key} has {found} values, must have {least} to {most}")));
     }
-    // The comparison a >= b would accept NaN.
+    // NaN must count as falling, but a >= b is false for NaN.
     let falling = list.array_windows().find(|[a, b]| a.partial_cmp(b) != Some(std::cmp::Ordering::Less));
     falling.map_or(Ok(()), |[a, b]| Err(LabError::Data(format!("{key}: {b} follows {a}, must rise"))))
 }

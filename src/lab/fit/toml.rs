@@ -103,16 +103,15 @@ fn measured(out: &mut String, outcome: &FitOutcome) {
     line(out, &format!("soc = [{:.3}, {:.3}]", range.soc.0, range.soc.1));
 }
 
-/// Returns the file name with its folder: enough to identify the file, without revealing anything else about the
-/// machine.
+/// Returns the file name with its folder, which identifies the file and reveals nothing else about the machine.
 fn file_name(path: &std::path::Path) -> String {
     let parts: Vec<_> = path.components().map(|part| part.as_os_str().to_string_lossy().into_owned()).collect();
     parts[parts.len().saturating_sub(2)..].join("/")
 }
 
 fn tables(out: &mut String, request: &FitRequest, outcome: &FitOutcome) {
-    // The model of an ageing cell describes this cell under its own conditions. The cycles of this cell cannot separate
-    // the effect of temperature from the effect of age.
+    // The tables of an ageing cell are not extended to other temperatures, because its cycles cannot separate the
+    // effects of temperature and age.
     let is_ageing = request.first_cycles.is_some();
     let (fit, errors) = (&outcome.fit, &outcome.voltage_error_v);
     let ModelTables { grid, tables, voltage_error_v } = match is_ageing {
@@ -136,12 +135,11 @@ fn tables(out: &mut String, request: &FitRequest, outcome: &FitOutcome) {
     }
 }
 
-/// Formats numbers as a TOML list, without the brackets.
 pub(crate) fn list(values: &[f64]) -> String {
     values.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ")
 }
 
-/// Writes `key = [[..], [..]]`. Numbers have `digits` decimals, or more if five significant digits need more.
+/// Writes `key = [[..], [..]]`. Numbers have `digits` decimals, or more if needed for five significant digits.
 pub(crate) fn table(out: &mut String, key: &str, rows: &[Vec<f64>], digits: usize) {
     line(out, &format!("{key} = ["));
     for row in rows {

@@ -1,18 +1,16 @@
 //! Describes the accuracy of a fitted model in plain words.
 //!
-//! Input: the error table of the model (V, for data outside the fit), the slopes of its open-circuit curve, and the
-//! fitted rows. Output: sentences. The SOC error at a breakpoint is the voltage error divided by the slope; the root
-//! mean square over [`MIDDLE`] is stated. This SOC error applies if the SOC is determined by voltage alone. Counting
-//! charge between readings reduces the error; sensor errors increase it.
+//! The SOC error is the voltage error (V, for data outside the fit) divided by the slope of the open-circuit curve, as
+//! a root mean square over [`MIDDLE`]. This error applies if voltage alone determines the SOC. Counting charge between
+//! readings reduces it; sensor errors increase it.
 
 use super::{FitOutcome, MeasuredRange};
 use crate::ident::fit::{FittedTables, MIN_SLOPE_V, SUPPORTED_S};
 
-/// SOC range over which errors are averaged. Below it, the curve is so steep that any model is accurate, and cells are
-/// rarely used there.
+/// SOC range over which errors are averaged. Lower SOC is left out: cells are rarely used there, and the steep curve
+/// makes any model accurate.
 const MIDDLE: std::ops::RangeInclusive<f64> = 0.1..=0.95;
 
-/// Returns the sentences for the end of the output.
 pub(super) fn verdict(outcome: &FitOutcome) -> Vec<String> {
     let FitOutcome { fit, voltage_error_v, .. } = outcome;
     let columns = fit.grid.soc.len();
@@ -46,14 +44,14 @@ fn mean_points(soc: &[f64], points: &[f64]) -> f64 {
     (middle.iter().sum::<f64>() / middle.len().max(1) as f64).sqrt()
 }
 
-/// Formats an error in points, rounded to half points, at least half a point.
+/// Rounds to half percentage points, at least half a point.
 fn rounded(points: f64) -> String {
     let halves = ((2.0 * points).round() / 2.0).max(0.5);
     format!("{halves} {}", if halves == 1.0 { "point" } else { "points" })
 }
 
 fn accuracy(rows: &[(f64, f64)]) -> Vec<String> {
-    // Largest SOC error (points) with which a temperature counts as good.
+    // A temperature counts as good if its SOC error is at most 2 points.
     let (good, poor): (Vec<_>, Vec<_>) = rows.iter().partition(|(_, points)| *points <= 2.0);
     let mut said = Vec::new();
     if let (Some((low_c, _)), Some((high_c, _))) = (good.first(), good.last()) {
@@ -68,9 +66,9 @@ fn accuracy(rows: &[(f64, f64)]) -> Vec<String> {
     said
 }
 
-/// Lists the SOC breakpoints at which the curve is too flat, at every temperature, to find the SOC from voltage.
+/// Lists the SOC breakpoints where the curve is too flat to find the SOC from voltage: the error exceeds 5 points at
+/// every temperature.
 fn flat(soc: &[f64], points: &[f64], columns: usize) -> Option<String> {
-    // If the SOC error (points) at a breakpoint exceeds this limit at every temperature, the curve is too flat there.
     let is_flat = |s: &usize| points.iter().skip(*s).step_by(columns).all(|points| *points > 5.0);
     let flat: Vec<String> = (0..columns).filter(is_flat).map(|s| soc[s].to_string()).collect();
     let list = flat.join(", ");

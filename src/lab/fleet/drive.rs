@@ -1,8 +1,6 @@
 //! Replays one log through one monitor, like `packwatch replay` but without its output files.
 //!
-//! Input: a log, and a monitor that has not received any input yet. Output: after each input, the outputs of the
-//! monitor are passed to a closure. The monitor receives the same inputs and ticks as from `packwatch replay`, so the
-//! results are the same.
+//! Inputs and ticks are the same as in `packwatch replay`, so the results are the same.
 
 use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
@@ -15,20 +13,20 @@ use crate::monitor::{Monitor, MonitorConfig, Outputs, Record, RecordKind, TICK_P
 use crate::quantity::Timestamp;
 use crate::replay::sleep_gap_s;
 
-/// An opened log, and a note for the user on how it is read.
+/// An opened log, and a note for the user on its interpretation.
 pub type OpenedLog = (LogSource, Option<String>);
 
 /// How to read logs.
 #[derive(Clone, Copy)]
 pub struct LogAccess<'a> {
-    /// Opens logs with a configuration. The logs are read one after the other, as one recording.
+    /// Opens logs with a configuration. Several logs are read one after the other as one recording.
     pub open: &'a (dyn Fn(&Config, &[PathBuf]) -> OpenedLog + Sync),
-    /// Longest gap in a log (s) before the recorder counts as asleep; `None` = the configuration decides.
+    /// A gap in a log longer than this (s) means that the recorder was asleep; `None` = the configuration decides.
     pub sleep_gap_s: Option<f64>,
 }
 
 impl LogAccess<'_> {
-    /// Sleep gap with a configuration (s).
+    /// Returns the sleep gap (s) for this configuration.
     pub(super) fn sleep_gap_of_s(&self, config: &MonitorConfig) -> f64 {
         self.sleep_gap_s.unwrap_or_else(|| sleep_gap_s(config))
     }
@@ -86,7 +84,7 @@ pub fn drive(
         }
         tick(&mut ticks, &mut monitor, Some(&record))?;
         records += 1;
-        // Number of records between two progress reports.
+        // Progress is reported every 4096 records.
         if records.is_multiple_of(4096) {
             let bytes = source.read_bytes().load(Ordering::Relaxed);
             report(bytes - reported);

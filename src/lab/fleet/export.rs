@@ -1,10 +1,9 @@
 //! Exports the results of logs as tables of estimates, half-cycles, energies and alarms, in Parquet or CSV format.
 //!
 //! Input: a configuration and logs. Output: for each log, a folder `NAME/` with `estimates`, `half_cycles`, `outlook`,
-//! `alarms` and `use_record` (`.parquet` or `.csv`; see [`columns`] for columns and units), and with `about.json`.
-//! `about.json` is written last: if it exists, the tables are complete. A file gets its final name only when it is complete. Memory holds one row
-//! group per table and log, no matter how long the log is. If a log cannot be replayed, its folder gets no new file,
-//! and the other logs continue.
+//! `alarms` and `use_record` (`.parquet` or `.csv`; see [`columns`] for columns and units), and with `about.json`. Each
+//! file gets its final name only when it is complete. `about.json` is written last, so the tables are complete if it
+//! exists. If a log cannot be replayed, its folder gets no new file, and the other logs continue.
 
 mod columns;
 pub mod merge;
@@ -64,12 +63,12 @@ pub struct ExportSettings<'a> {
     pub format: TableFormat,
     /// Folder that contains the folders of the logs.
     pub out: PathBuf,
-    /// Length of a period (s); at most one estimate per cell and period is written. 0 = all estimates; `None` = no
+    /// Length of a period (s). At most one estimate per cell and period is written. 0 = all estimates; `None` = no
     /// table of estimates.
     pub period_s: Option<f64>,
     /// Number of threads; `None` = all cores.
     pub jobs: Option<usize>,
-    /// Settings for reading logs, as text. The texts of two exports differ if these settings differ.
+    /// Settings for reading logs, as text. Exports with different settings have different texts.
     pub reading: String,
 }
 
@@ -86,7 +85,7 @@ pub struct ExportResult {
     pub days: f64,
     /// Notes for the user.
     pub notes: Vec<String>,
-    /// The model that was learned from the log.
+    /// Cell model that was learned from the log.
     #[serde(skip)]
     pub model: Option<LearnedModel>,
 }
@@ -149,7 +148,7 @@ pub(super) fn export(
     Ok(exported)
 }
 
-/// Removes the `about.json` of an earlier export, because the tables are then replaced one by one. Returns a note if
+/// Removes the `about.json` of an earlier export, because its tables are then replaced one by one. Returns a note if
 /// the earlier tables came from another log.
 fn remove_about(folder: &Path, log: &Path) -> Result<Option<String>, LabError> {
     let path = folder.join(ABOUT);
@@ -161,7 +160,6 @@ fn remove_about(folder: &Path, log: &Path) -> Result<Option<String>, LabError> {
     Ok(other.map(|other| format!("replaced the tables of {other}")))
 }
 
-/// Returns the metadata of the files.
 fn metadata(
     config: &Config,
     log: &Path,
@@ -232,14 +230,12 @@ pub(super) fn names(logs: &[PathBuf]) -> Vec<String> {
     names
 }
 
-/// Replaces characters that are not safe in file names.
 pub(super) fn clean(name: &str) -> String {
     let safe = |letter: char| if letter.is_ascii_alphanumeric() || "._-".contains(letter) { letter } else { '_' };
     let name: String = name.chars().map(safe).collect();
     if name.starts_with('.') { format!("_{name}") } else { name }
 }
 
-/// Writers of the tables of one log.
 struct LogTables {
     log: Arc<str>,
     estimates: Option<TableFile<EstimateRow>>,
@@ -249,11 +245,11 @@ struct LogTables {
     uses: TableFile<UseRow>,
     period_ns: i64,
     first: Option<Timestamp>,
-    /// For each cell, the number of the period to which the last written estimate belongs.
+    /// For each cell, the period of the last written estimate.
     periods: Vec<Option<i64>>,
     rated_ah: f64,
     moved_ah: Vec<f64>,
-    /// Cell and values of the last half-cycle, until its capacity event arrives.
+    /// Cell and values of a half-cycle whose capacity event has not arrived.
     half_cycle: Option<(CellIndex, Fields)>,
 }
 
@@ -331,13 +327,11 @@ impl LogTables {
         self.moved_ah.get(cell.index()).map_or(f64::NAN, |moved_ah| moved_ah / (2.0 * self.rated_ah))
     }
 
-    /// Time since the first result, ns.
     fn since_ns(&mut self, time: Timestamp) -> i64 {
         let first = *self.first.get_or_insert(time);
         time.nanos().saturating_sub(first.nanos())
     }
 
-    /// Completes the files and writes their metadata. Returns the number of rows of each table.
     fn finish(
         mut self,
         record: &UseRecord,

@@ -1,20 +1,19 @@
 //! Scores the alarms of one threshold in one log: lead time before the end of life, missed alarms and false alarms.
 //!
-//! The terms come from `tests/alarm_tradeoff.md`. Here they also cover logs that end before the life does:
+//! The terms come from `tests/alarm_tradeoff.md`. Here, they also cover logs that end before the end of life:
 //!
 //! * **end of life**: if the true capacities are known, the first time at which the capacity of a cell is below the
 //!   limit. Otherwise, the time from which the weakest learned capacity stays below the limit until the end of the log.
-//! * **true raise**: a raise before the end of life. With a horizon, the raise must be at most the horizon before the
-//!   end of life.
-//! * **false alarm**: with a horizon, a raise that is not followed by the end of life within the horizon. Without a
+//! * **true raise**: a raise before the end of life and, with a horizon, within the horizon before it.
+//! * **false alarm**: with a horizon, a raise after which the end of life does not follow within the horizon. Without a
 //!   horizon, any raise in a log without an end of life. Raises at or after the end of life are neither true nor false.
-//! * **open**: with a horizon, a raise in a log without an end of life, at most the horizon before the end of the log.
-//!   Such a raise cannot be judged.
+//! * **open**: with a horizon, a raise in a log without an end of life, within the horizon before the end of the log.
+//!   Open raises cannot be judged.
 //! * **lead**: time from the first true raise to the end of life, in days and in equivalent full cycles.
 //! * **missed**: the end of life was reached without a true raise.
-//! * **false raise**: a raise of `capacity_low` while the true capacity of the cell was above the threshold; counted
-//!   only if the true capacities come from a simulation, not from published data.
-//! * **flickers**: clears before the end of life; all clears if the end of life was not reached.
+//! * **false raise**: a raise of `capacity_low` while the true capacity of the cell is above the threshold. It is
+//!   counted only if the true capacities come from a simulation, not from published data.
+//! * **flickers**: clears before the end of life. Without an end of life, all clears count.
 //!
 //! Only rules about ageing (rules on learned values) are judged. For other rules, raises and clears are only counted.
 
@@ -52,7 +51,7 @@ pub struct LogLife<'a> {
     pub horizon: Option<Horizon>,
 }
 
-/// The first raise of a threshold.
+/// First raise of a threshold.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct FirstRaise {
     /// Time of the raise on the clock of the log (s).
@@ -70,27 +69,27 @@ pub struct FirstRaise {
 /// Score of one threshold's alarms in one log.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct AlarmScore {
-    /// First raise of the threshold, even if it came after the end of life; `None` = the alarm was never raised.
+    /// First raise, even after the end of life; `None` = the alarm was never raised.
     pub first: Option<FirstRaise>,
     /// Number of all raises.
     pub raises: usize,
     /// Lead time (days).
     pub lead_days: Option<f64>,
-    /// Lead time, equivalent full cycles.
+    /// Lead time (equivalent full cycles).
     pub lead_cycles: Option<f64>,
-    /// Whether the end of life was reached without a true raise; `None` = the end of life was not reached, the log
-    /// starts after the end of life, or the rule is not about ageing.
+    /// Whether the end of life was reached without a true raise. `None` = the end of life was not reached, the log
+    /// starts after it, or the rule is not about ageing.
     pub missed: Option<bool>,
     /// Number of false alarms; `None` = the rule is not about ageing, or the log starts after the end of life.
     pub false_alarms: Option<usize>,
     /// Number of raises that cannot be judged; `None` as for `false_alarms`.
     pub open: Option<usize>,
-    /// Number of raises while the true capacity was above the threshold; `None` = the rule is not `capacity_low`, or
+    /// Number of raises while the true capacity was above the threshold. `None` = the rule is not `capacity_low`, or
     /// the true capacities do not come from a simulation.
     pub false_raises: Option<usize>,
     /// Number of clears before the end of life.
     pub flickers: usize,
-    /// Number of raises and clears that exceeded the limit of stored changes.
+    /// Number of raises and clears that were not stored.
     pub not_kept: u64,
 }
 

@@ -1,4 +1,4 @@
-//! Turns the models that the vehicles of a fleet have learned into a prior for the next vehicle with the same label.
+//! Combines the models that the vehicles of a fleet have learned into a prior for the next vehicle with the same label.
 //!
 //! Input: a folder of merged tables with `models.jsonl`, which has a line per learned model. Output: a [`FleetPrior`].
 //! The same models give the same prior.
@@ -11,10 +11,9 @@ use crate::error::LabError;
 
 /// File with the learned models, in the folder of the merged tables.
 pub const MODELS: &str = "models.jsonl";
-/// Fewest vehicles of a prior. The spread between two vehicles says almost nothing about the spread between all.
+/// Fewest vehicles of a prior. Two vehicles say almost nothing about the spread of all vehicles.
 const LEAST_VEHICLES: usize = 3;
 
-/// Writes the learned models of all vehicles, in the order of the vehicles' names.
 pub(super) fn write_models(folder: &Path, models: &[LearnedModel]) -> Result<(), LabError> {
     let mut text = String::new();
     for model in models {
@@ -23,7 +22,7 @@ pub(super) fn write_models(folder: &Path, models: &[LearnedModel]) -> Result<(),
     Ok(crate::write_file(&folder.join(MODELS), text.as_bytes())?)
 }
 
-/// Combines the models whose label is wanted, in a folder of merged tables.
+/// Combines the models with a wanted label in a folder of merged tables.
 ///
 /// # Errors
 /// The file is missing or damaged, the wanted models have several labels, or fewer than three vehicles have a wanted
@@ -39,7 +38,7 @@ pub fn combine(folder: &Path, is_wanted: impl Fn(&Label) -> bool) -> Result<Flee
         let LearnedModel { label, own, has_prior } = serde_json::from_str(line).map_err(|error| of_line(&error))?;
         own.check().map_err(|error| of_line(&error))?;
         if has_prior {
-            // Its model repeats what its prior says, so it would count the same vehicles twice.
+            // A model that started from a prior repeats the prior, so it would count the same vehicles twice.
             continue;
         }
         match by_label.iter_mut().find(|(known, _)| *known == label) {

@@ -1,8 +1,8 @@
 //! Tracks use and wear during a log: charge moved, and the learned capacity of the weakest cell.
 //!
-//! Input: events of the monitor. Output: equivalent full cycles (charge moved divided by twice the rated capacity), and
-//! learned capacities. Both values are known at the ends of half-cycles. Between the ends, the cycles are interpolated,
-//! and the capacities keep their last value.
+//! Use is counted in equivalent full cycles (charge moved divided by twice the rated capacity). Cycles and capacities
+//! are known at the ends of half-cycles. Between the ends, the cycles are interpolated, and the capacities keep their
+//! last value.
 
 use std::collections::BTreeMap;
 
@@ -18,9 +18,9 @@ pub struct Track {
     learned: EndOfLifeSource,
     moved_ah: BTreeMap<CellIndex, f64>,
     capacity_ah: BTreeMap<CellIndex, f64>,
-    /// For each end of a half-cycle: time, and equivalent full cycles up to this time.
+    /// Time of each end of a half-cycle, and the equivalent full cycles up to this time.
     cycles: Vec<(Timestamp, f64)>,
-    /// For each end of a half-cycle: time, weakest learned capacity (Ah) and its cell.
+    /// Time of each end of a half-cycle, the weakest learned capacity (Ah) and its cell.
     weakest: Vec<(Timestamp, f64, CellIndex)>,
 }
 
@@ -51,8 +51,8 @@ impl Track {
         *moved_ah += charge_ah;
         let cycles = *moved_ah / (2.0 * self.rated_ah);
         let most = self.cycles.last().map_or(0.0, |last| last.1);
-        // All cells of a string move the same charge, so the largest count applies: a cell without estimates for some
-        // time has counted too little.
+        // All cells of a string move the same charge. A cell without estimates counts too little, so the largest count
+        // applies.
         if cycles > most {
             self.cycles.pop_if(|last| last.0 == time);
             self.cycles.push((time, cycles));
@@ -89,9 +89,8 @@ impl Track {
         self.learned
     }
 
-    /// Returns the time from which the weakest learned capacity stays below `end_ah` until the end of the log, and the
-    /// weakest cell at this time. `None` = the capacity is not below `end_ah` at the end of the log, or nothing was
-    /// learned.
+    /// Returns the time from which the weakest learned capacity stays below `end_ah`, and the weakest cell at this
+    /// time. `None` = the capacity at the end is not below `end_ah`, or nothing was learned.
     pub fn stays_below(&self, end_ah: f64) -> Option<(Timestamp, CellIndex)> {
         let below = self.weakest.iter().rev().take_while(|(_, ah, _)| *ah < end_ah).last();
         below.map(|&(time, _, cell)| (time, cell))

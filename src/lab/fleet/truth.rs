@@ -1,13 +1,12 @@
 //! Reads the true capacities of a log from a CSV file in the same folder.
 //!
-//! There are two formats, which are recognised by their columns. A table with a column `cell` was written by `simulate
-//! --truth`; it contains, for every cell, the capacity from the full to the empty open-circuit voltage. A table with
-//! `cycle` and `type` has the format of `score --cycles`; it contains the published capacity of one cell for each
-//! discharge, at the load of this discharge.
+//! The columns distinguish two formats. A table with a column `cell` was written by `simulate --truth`. It contains the
+//! capacity of every cell from the full to the empty open-circuit voltage. A table with `cycle` and `type` has the
+//! format of `score --cycles`. It contains the published capacity of one cell for each discharge, at the load of this
+//! discharge.
 //!
-//! For a log `NAME.log`, `NAME.csv` etc., the folder of the log is searched for these files: `NAME.truth.csv`,
-//! `NAME_truth.csv` and `NAME_cycles.csv`, and also `truth.csv` if no other given log is in the folder. Each may end in
-//! `.gz` or `.zst`.
+//! For a log `NAME.log`, `NAME.csv` etc., the files `NAME.truth.csv`, `NAME_truth.csv` and `NAME_cycles.csv` are
+//! searched for. `truth.csv` is also used if no other given log is in the folder. Each name may end in `.gz` or `.zst`.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -19,7 +18,6 @@ use crate::io::table::TableError;
 use crate::quantity::{CellIndex, Timestamp};
 use crate::score::CycleTable;
 
-/// Endings of the file names that are searched for.
 const ENDINGS: [&str; 3] = [".truth.csv", "_truth.csv", CYCLES];
 const CYCLES: &str = "_cycles.csv";
 const COMPRESSED: [&str; 3] = ["", ".gz", ".zst"];
@@ -58,7 +56,6 @@ impl EndOfLifeSource {
 pub struct Truth {
     /// Source of the capacities.
     pub kind: EndOfLifeSource,
-    /// Capacities per cell, in order of time.
     cells: BTreeMap<CellIndex, Vec<(Timestamp, f64)>>,
     span: (Timestamp, Timestamp),
 }
@@ -66,8 +63,7 @@ pub struct Truth {
 impl Truth {
     /// Reads a truth table in either format.
     /// # Errors
-    /// The file cannot be read, has neither format, or a field is wrong. The error states file, line, what was found
-    /// and what is allowed.
+    /// The file cannot be read, has neither format, or a field is wrong.
     pub fn read(path: &Path) -> Result<Self, TableError> {
         let table = CapacityTable::open_in_order(path)?;
         if table.header().find("cell").is_some() { read_simulated(table) } else { Self::of_table(path) }
@@ -81,7 +77,7 @@ impl Truth {
         Ok(Self { kind: EndOfLifeSource::Published, cells: BTreeMap::from([(CellIndex(0), points)]), span })
     }
 
-    /// Returns the first time at which the capacity of a cell is below `end_ah`, and this cell.
+    /// Returns the first time at which the capacity of any cell is below `end_ah`, and this cell.
     pub fn falls_below(&self, end_ah: f64) -> Option<(Timestamp, CellIndex)> {
         let of_cell = |(&cell, points): (&CellIndex, &Vec<(Timestamp, f64)>)| {
             points.iter().find(|(_, ah)| *ah < end_ah).map(|(time, _)| (*time, cell))
@@ -89,7 +85,7 @@ impl Truth {
         self.cells.iter().filter_map(of_cell).min()
     }
 
-    /// Returns the capacity of a cell in the last row up to `time`; `None` = no such row.
+    /// Returns the capacity of a cell in the last row up to `time`; `None` = there is no such row.
     pub fn capacity_ah(&self, cell: CellIndex, time: Timestamp) -> Option<f64> {
         let points = self.cells.get(&cell)?;
         let after = points.partition_point(|(at, _)| *at <= time);
@@ -120,7 +116,7 @@ fn read_simulated(mut table: CapacityTable) -> Result<Truth, TableError> {
     Ok(Truth { kind: EndOfLifeSource::Truth, cells, span })
 }
 
-/// Finds the file with the true capacities of each log, if the file exists.
+/// Finds the file with the true capacities of each log; `None` = there is no file.
 pub fn find_next_to(logs: &[PathBuf]) -> Vec<Option<PathBuf>> {
     let alone = |log: &PathBuf| logs.iter().filter(|other| other.parent() == log.parent()).count() == 1;
     logs.iter().map(|log| find(log, alone(log))).collect()
@@ -148,7 +144,7 @@ fn stem_of(log: &Path) -> Option<(&str, &str)> {
     Some(name.rsplit_once('.').unwrap_or((name, "")))
 }
 
-/// Returns the first of these names that is a file in the folder of the log, compressed or not.
+/// Returns the first name that is a file in the folder of the log, compressed or not.
 fn existing(log: &Path, names: impl IntoIterator<Item = String>) -> Option<PathBuf> {
     let paths =
         names.into_iter().flat_map(|name| COMPRESSED.map(|ending| log.with_file_name(format!("{name}{ending}"))));

@@ -1,14 +1,14 @@
 //! Evaluates the alarms of many settings in one replay.
 //!
-//! Estimates do not depend on alarm thresholds, and the alarms of one threshold do not depend on other thresholds. So
-//! the alarm inputs of one monitor are passed to additional alarm engines, the *lanes*. For each pair of rule and
-//! severity, lane n watches the n-th distinct threshold. For example, five thresholds of one rule and five thresholds
-//! of another rule make 25 combinations but need only five lanes.
+//! Estimates do not depend on alarm thresholds, and the alarms of one threshold do not depend on other thresholds. The
+//! alarm inputs of one monitor are therefore passed to additional alarm engines, the *lanes*. For each pair of rule and
+//! severity, lane n has the n-th distinct threshold. For example, five thresholds each of two rules make 25
+//! combinations but need only five lanes.
 
 use crate::alarm::{AlarmChange, AlarmEngine, AlarmInput, Change, Rule, RuleConfig, Severity};
 use crate::quantity::{CellIndex, Timestamp};
 
-/// Maximum number of raises, and of clears, that are stored per threshold and log. Further ones are only counted.
+/// Maximum number of raises, and of clears, that are stored per threshold and log. More are only counted.
 const MAX_KEPT: usize = 20_000;
 
 /// A raised alarm.
@@ -29,11 +29,10 @@ pub struct AlarmHistory {
     pub raises: Vec<Raise>,
     /// Times of the clears, in order.
     pub clears: Vec<Timestamp>,
-    /// Number of raises and clears that exceeded the limit of stored changes.
+    /// Number of raises and clears that were not stored.
     pub not_kept: u64,
 }
 
-/// A threshold in its lane.
 #[derive(Debug, Clone)]
 struct BatchThreshold {
     config: RuleConfig,
@@ -41,14 +40,12 @@ struct BatchThreshold {
     history: AlarmHistory,
 }
 
-/// Thresholds of all settings that share a replay, each with its lane.
 #[derive(Debug, Clone, Default)]
 pub(super) struct VariantBatch {
     watched: Vec<BatchThreshold>,
 }
 
 impl VariantBatch {
-    /// Adds a threshold if it is new; returns its number.
     pub(super) fn watch(&mut self, config: &RuleConfig) -> usize {
         if let Some(known) = self.watched.iter().position(|watched| watched.config == *config) {
             return known;
@@ -59,7 +56,6 @@ impl VariantBatch {
         self.watched.len() - 1
     }
 
-    /// Creates the alarm engines of all lanes.
     pub(super) fn engines(&self, cells: u16) -> LaneEngines {
         let batch = self.watched.iter().map(|watched| watched.lane + 1).max().unwrap_or(0);
         let rules = |lane| self.watched.iter().filter(move |watched| watched.lane == lane);
@@ -88,7 +84,6 @@ impl VariantBatch {
         }
     }
 
-    /// Returns the raises and clears of the threshold with this number.
     pub(super) fn history(&self, number: usize) -> Option<&AlarmHistory> {
         self.watched.get(number).map(|watched| &watched.history)
     }
@@ -98,16 +93,15 @@ fn has_rule(watched: &BatchThreshold, rule: Rule, severity: Severity) -> bool {
     (watched.config.rule, watched.config.severity) == (rule, severity)
 }
 
-/// The alarm engines of all lanes during one replay.
 #[derive(Debug)]
 pub(super) struct LaneEngines {
-    /// Each engine with the rules that it watches: bit n is set for the rule with wire number n.
+    /// Each engine with its rules: bit n is set for the rule with wire number n.
     engines: Vec<(AlarmEngine, u32)>,
     changes: Vec<AlarmChange>,
 }
 
 impl LaneEngines {
-    /// Passes the alarm inputs of the monitor to all lanes and records the changes of their alarms.
+    /// Passes the monitor's alarm inputs to all lanes, and records the changes of their alarms.
     pub(super) fn take(&mut self, inputs: &[(Timestamp, AlarmInput)], batch: &mut VariantBatch) {
         for (time, input) in inputs {
             for (lane, (engine, watches)) in self.engines.iter_mut().enumerate() {
@@ -120,7 +114,6 @@ impl LaneEngines {
     }
 }
 
-/// Whether an input is relevant for an engine that watches these rules.
 fn concerns(input: &AlarmInput, watches: u32) -> bool {
     match input {
         AlarmInput::Observe { rule, .. } | AlarmInput::InputsValid { rule, .. } => watches & 1 << (*rule as u8) != 0,

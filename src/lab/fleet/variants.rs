@@ -1,16 +1,18 @@
 //! Implements `--set KEY=V1,V2`: replaces values of a configuration, and builds all combinations of the replaced
 //! values.
 //!
-//! Input: the file of a configuration, and choices (one per `--set`). Output: one checked configuration per
-//! combination, with the original first, each with the number of its replay. Combinations share a replay if their
-//! configurations differ only in `[[alarm]]` tables. Tables of the rule `input_missing` are an exception, because their
-//! time-outs also affect the inputs of the alarms. A combination that is not a valid configuration is left out and
-//! reported.
+//! Input: the file of a configuration, and choices (one per `--set`). Output: one checked configuration per combination
+//! with the number of its replay, the original first. Combinations share a replay if their configurations differ only
+//! in `[[alarm]]` tables. Tables of the rule `input_missing` are an exception, because their time-outs also affect the
+//! inputs of the alarms. A combination that is not a valid configuration is left out and reported.
 //!
-//! Keys for alarms: `RULE.info`, `.warning` and `.severe` (each also with `.set` or `.clear`); `RULE.threshold` for the
-//! most severe level in the file; `RULE.probability` for `when = { probability = ... }`; and any other key of the
-//! rule's `[[alarm]]` tables. All other keys are dotted keys of the configuration. A table that occurs several times is
-//! selected by `[n]`, counted from 1.
+//! | key | meaning |
+//! | --- | --- |
+//! | `RULE.info`, `RULE.warning`, `RULE.severe`, each also with `.set` or `.clear` | threshold |
+//! | `RULE.threshold` | most severe threshold in the file |
+//! | `RULE.probability` | `when = { probability = ... }` |
+//! | `RULE.` and any other key of an `[[alarm]]` table | this key in all tables of the rule |
+//! | any other dotted key | key of the configuration; `[n]`, from 1, selects one of several tables |
 
 mod target;
 
@@ -22,7 +24,7 @@ use self::target::{Target, name_rules, rule_of, targets};
 use crate::alarm::Rule;
 use crate::config::{self, Config, ConfigFiles};
 
-/// Maximum number of combinations: a longer table is not readable.
+/// Maximum number of combinations. A longer table is not readable.
 pub const MAX_COMBINATIONS: usize = 1000;
 /// One `--set` option.
 #[derive(Debug, Clone, PartialEq)]
@@ -91,7 +93,7 @@ pub struct Variant {
 /// All combinations.
 #[derive(Debug, Clone)]
 pub struct VariantGrid {
-    /// The keys, as written.
+    /// Keys as written.
     pub keys: Vec<String>,
     /// The original configuration, followed by every combination.
     pub variants: Vec<Variant>,
@@ -138,7 +140,7 @@ pub fn grid(path: &Path, choices: &[Choice]) -> Result<VariantGrid, Vec<String>>
                 if first_refused.is_empty() {
                     let set: Vec<_> =
                         grid.keys.iter().zip(&combination).map(|(k, (v, _))| format!("{k}={v}")).collect();
-                    // At most three faults of one combination are quoted.
+                    // The note quotes at most three faults, of the first invalid combination.
                     first_refused = faults.iter().take(3).map(|f| format!("{}: {f}", set.join(" "))).collect();
                 }
             }
@@ -155,7 +157,7 @@ pub fn grid(path: &Path, choices: &[Choice]) -> Result<VariantGrid, Vec<String>>
     Ok(grid)
 }
 
-/// Returns the configuration of a combination, and its replay key. Combinations with equal replay keys share a replay.
+/// Returns the configuration of a combination and its replay key. Combinations with equal keys share a replay.
 fn variant(
     path: &Path,
     root: &Table,
@@ -169,7 +171,7 @@ fn variant(
     let text = toml::to_string(&root).map_err(|error| vec![error.to_string()])?;
     let read = |file: &Path| if file == path { Ok(text.clone().into_bytes()) } else { std::fs::read(file) };
     let config = config::load_with(&ConfigFiles::alone(path), &read).map_err(|faults| {
-        // Remove the line numbers of these faults, because they refer to a generated text.
+        // The line numbers refer to a generated text, so they are removed.
         let file = format!("{}:", path.display());
         let without_line = |fault: &String| {
             let rest = fault.strip_prefix(&file).map(|rest| rest.trim_start_matches(|c: char| c.is_ascii_digit()));
@@ -180,13 +182,12 @@ fn variant(
     Ok((config, replay_key(&root)))
 }
 
-/// Returns the merged tables of the configuration and its drop-ins.
 fn read(path: &Path) -> Result<Table, Vec<String>> {
     let text = config::merged(path).map_err(|faults| faults.0)?;
     text.parse::<Table>().map_err(|error| vec![format!("{}: {}", path.display(), error.message())])
 }
 
-/// Returns everything in a configuration that can affect estimates and the values of rules.
+/// Returns everything in a configuration that can affect estimates or the values of rules.
 fn replay_key(root: &Table) -> String {
     let mut root = root.clone();
     if let Some(Value::Array(alarms)) = root.get_mut("alarm") {
@@ -196,7 +197,7 @@ fn replay_key(root: &Table) -> String {
     toml::to_string(&root).unwrap_or_else(|error| format!("{error} {root:?}"))
 }
 
-/// Returns every combination. The last choice changes fastest. Without choices, the list is empty.
+/// Returns every combination; the last choice changes fastest. Without choices, the list is empty.
 fn combinations(choices: &[Choice]) -> Result<Vec<Vec<&(String, Value)>>, String> {
     if choices.is_empty() {
         return Ok(Vec::new());

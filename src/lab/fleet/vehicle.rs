@@ -7,7 +7,6 @@ use serde::{Deserialize, Serialize};
 
 use crate::cell::{Label, OwnModel};
 
-/// Version of `vehicle.json`.
 pub(super) const VERSION: u32 = 2;
 /// Name of the file with the result, in the vehicle's folder.
 pub(super) const RECORD: &str = "vehicle.json";
@@ -16,9 +15,9 @@ pub(super) const RECORD: &str = "vehicle.json";
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Vehicle {
-    /// Name of the vehicle. It is also the name of its folder, and the value in the first column of its tables.
+    /// Name of the vehicle, of its folder, and in the first column of its tables.
     pub vehicle: String,
-    /// Size of the vehicle's logs, bytes.
+    /// Size of the vehicle's logs (bytes).
     pub bytes: u64,
     /// Logs of the vehicle, in the order of recording.
     pub logs: Vec<PathBuf>,
@@ -36,12 +35,12 @@ pub struct VehicleRecord {
     pub packwatch: String,
     /// The line of the manifest.
     pub line: Vehicle,
-    /// SHA-256 of all settings (configuration with its DBC files and cell model, and the options for reading logs);
+    /// SHA-256 of all settings: configuration with its DBC files and cell model, and the options for reading logs.
     /// `None` = the configuration cannot be read.
     pub settings_sha256: Option<String>,
     /// Period of the estimates (s); `None` = no table of estimates.
     pub period_s: Option<f64>,
-    /// Why the tables are missing; `None` = the tables exist.
+    /// Reason for missing tables; `None` = the tables exist.
     pub error: Option<String>,
     /// Number of rows of each table.
     pub rows: BTreeMap<String, u64>,
@@ -53,24 +52,24 @@ pub struct VehicleRecord {
     pub days: f64,
     /// Notes on the logs.
     pub notes: Vec<String>,
-    /// The model of the vehicle's cells that was learned from the logs; `None` = none was learned.
+    /// Cell model that was learned from the logs; `None` = no model was learned.
     pub model: Option<LearnedModel>,
 }
 
-/// A model that was learned from the logs of a vehicle, with the label from which learning started.
+/// A cell model learned from the logs of a vehicle, with the label from which learning started.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LearnedModel {
-    /// The label.
+    /// Label from which learning started.
     pub label: Label,
-    /// The model.
+    /// The learned model.
     pub own: OwnModel,
     /// Whether learning started from the prior of a fleet (`pack.prior`).
     pub has_prior: bool,
 }
 
 impl VehicleRecord {
-    /// Reads the result from a vehicle's folder; `None` = the vehicle is incomplete, or the file has another version.
+    /// Reads the result from a vehicle's folder; `None` = the replay is incomplete, or the file has another version.
     pub fn read(folder: &Path) -> Option<Self> {
         let text = std::fs::read(folder.join(RECORD)).ok()?;
         serde_json::from_slice(&text).ok().filter(|record: &Self| record.version == VERSION)

@@ -6,10 +6,10 @@
 //! | [`Shard::choose`] | all vehicles | the vehicles of one part; parts have similar sizes, the same on every machine |
 //! | [`run`] | vehicles | a folder for each vehicle with `vehicle.json` and the tables of [`export`](super::export) |
 //!
-//! `vehicle.json` is written last. If it exists for the same manifest line, settings and program and contains no error,
-//! the vehicle is complete and is not replayed again. If a vehicle fails, its `vehicle.json` contains the reason, and
-//! the other vehicles continue. The folder of a vehicle is locked during its replay: a second process waits, and then
-//! finds that the vehicle is complete.
+//! `vehicle.json` is written last. If it has the same manifest line, settings and program and contains no error, the
+//! vehicle is complete and is not replayed again. If a vehicle fails, its `vehicle.json` contains the reason, and the
+//! other vehicles continue. A vehicle's folder is locked during its replay. A second process waits for the lock and
+//! then finds the vehicle complete.
 
 use std::collections::BTreeMap;
 use std::ffi::OsStr;
@@ -25,13 +25,11 @@ use crate::config::Config;
 use crate::error::LabError;
 use crate::io::json::json_fault;
 
-/// File that is locked while a vehicle is replayed.
 const LOCK: &str = ".lock";
-/// Maximum number of parts of a fleet.
 const MAX_SHARDS: usize = 100_000;
 
-/// Lists the vehicles in `paths`, sorted by name. Each log is a vehicle. Each folder with logs is also a vehicle; its
-/// logs are read in the order of their names. Paths are made absolute, because the vehicles may be replayed from other
+/// Lists the vehicles in `paths`, sorted by name. Each log and each folder with logs is a vehicle. The logs of a folder
+/// are read in the order of their names. Paths become absolute, because the vehicles may be replayed from other
 /// folders.
 ///
 /// # Errors
@@ -54,7 +52,6 @@ pub fn plan(paths: &[PathBuf]) -> Result<Vec<Vehicle>, LabError> {
     Ok(vehicles)
 }
 
-/// Returns the logs in a folder, sorted by name.
 fn logs_in(folder: &Path) -> Result<Vec<PathBuf>, LabError> {
     let failed = |error: std::io::Error| LabError::File(format!("{}: cannot be read: {error}", folder.display()));
     let mut logs = Vec::new();
@@ -74,8 +71,7 @@ fn logs_in(folder: &Path) -> Result<Vec<PathBuf>, LabError> {
     Ok(logs)
 }
 
-/// Whether a file name, with or without the ending of a compression, belongs to a log. Truth tables and cycle tables
-/// are not logs.
+/// Whether a file name belongs to a log, compressed or not. Truth tables and cycle tables are not logs.
 fn is_log(name: &OsStr) -> bool {
     let name = name.to_string_lossy();
     let name = crate::without_compression(&name);
@@ -98,8 +94,8 @@ pub fn manifest(vehicles: &[Vehicle]) -> Result<String, LabError> {
 /// Reads a manifest.
 ///
 /// # Errors
-/// The file cannot be read or contains no vehicle, a line is not a vehicle, or two lines have the same vehicle name. If
-/// a line is at fault, the error names it.
+/// The file cannot be read or contains no vehicle, a line is not a vehicle, or two lines have the same vehicle name.
+/// The error names the faulty line.
 pub fn read_manifest(path: &Path) -> Result<Vec<Vehicle>, LabError> {
     let shown = path.display();
     let text = std::fs::read_to_string(path)
@@ -154,15 +150,15 @@ impl FromStr for Shard {
 }
 
 impl Shard {
-    /// Returns the vehicles of this part. The vehicles are distributed by falling size; each goes to the part with the
-    /// fewest bytes so far.
+    /// Returns the vehicles of this part. In the order of falling size, each vehicle goes to the part with the fewest
+    /// bytes so far.
     pub fn choose<'v>(&self, vehicles: &'v [Vehicle]) -> Vec<&'v Vehicle> {
         let mut largest: Vec<&Vehicle> = vehicles.iter().collect();
         largest.sort_by(|a, b| b.bytes.cmp(&a.bytes).then_with(|| a.vehicle.cmp(&b.vehicle)));
         let mut sizes = vec![0_u64; self.of];
         largest.retain(|vehicle| {
             let smallest = (0..self.of).min_by_key(|part| sizes[*part]).unwrap_or(0);
-            // Even an empty log takes some time.
+            // An empty log takes some time too.
             sizes[smallest] = sizes[smallest].saturating_add(vehicle.bytes.max(1));
             smallest + 1 == self.number
         });
@@ -182,7 +178,7 @@ pub enum Outcome {
 }
 
 /// Replays the vehicles. Returns the outcomes in the same order. `config_of` reads the configuration of a vehicle.
-/// `report` receives the number of bytes read since its last call; for a complete vehicle, this is the size of its
+/// `report` receives the number of bytes read since its last call. For a complete vehicle, it receives the size of the
 /// logs.
 ///
 /// # Errors
@@ -232,14 +228,14 @@ fn replay(
         report(vehicle.bytes);
         return Ok(Outcome::Complete(earlier));
     }
-    // The folder is incomplete from here on.
+    // Without these files, the folder counts as incomplete.
     for file in [RECORD, export::ABOUT] {
         match std::fs::remove_file(folder.join(file)) {
             Err(error) if error.kind() != std::io::ErrorKind::NotFound => return Err(named(&folder, &error)),
             _ => {}
         }
     }
-    // A defect of the program that one vehicle triggers must not stop the other vehicles.
+    // A bug that one vehicle triggers must not stop the other vehicles.
     let replayed = catch_unwind(AssertUnwindSafe(|| {
         let config = config?;
         export::export(&config, &vehicle.logs, &vehicle.vehicle, settings, report)

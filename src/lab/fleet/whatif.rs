@@ -1,8 +1,7 @@
 //! Evaluates the alarms of every combination of settings in each log.
 //!
-//! Input: a [`VariantGrid`], logs, and their true capacities. Output: for each log, its life, and an [`AlarmScore`] per
-//! combination and threshold. Combinations that differ only in alarms share one replay per log ([`VariantBatch`]). The
-//! life (charge moved, learned capacity) comes from the original configuration.
+//! Combinations that differ only in alarms share one replay per log ([`VariantBatch`]). The life (charge moved, learned
+//! capacity) comes from the original configuration.
 
 use std::path::PathBuf;
 
@@ -25,7 +24,7 @@ use crate::monitor::{Monitor, Outputs};
 pub struct WhatifJob {
     /// The log.
     pub log: PathBuf,
-    /// CSV file of the true capacities; `None` = the file does not exist.
+    /// CSV file of the true capacities; `None` = there is no file.
     pub truth: Option<PathBuf>,
 }
 
@@ -38,7 +37,7 @@ pub struct WhatifSettings<'a> {
     pub end_of_life_ah: f64,
     /// Whether the limit applies to the usable capacity, if its computation is configured.
     pub judges_usable: bool,
-    /// Longest time from a true raise to the end of life; `None` = unlimited.
+    /// Maximum time from a correct alarm to the end of life; `None` = unlimited.
     pub horizon: Option<Horizon>,
     /// Number of threads; `None` = all cores.
     pub jobs: Option<usize>,
@@ -96,12 +95,11 @@ pub struct LogResult {
     pub notes: Vec<String>,
 }
 
-/// Result of one replay.
 struct ReplayResult {
     driven: DriveSummary,
     track: Track,
     batch: VariantBatch,
-    /// True capacities; read only for the first replay of a log.
+    /// True capacities. They are read only for the first replay of a log.
     truth: Option<Truth>,
 }
 
@@ -116,22 +114,22 @@ pub fn run(
     settings: &WhatifSettings<'_>,
     report: &(dyn Fn(u64) + Sync),
 ) -> Result<Vec<Result<LogResult, LabError>>, LabError> {
-    // The replays of one log are independent, so several cores can work on a single log.
+    // Several cores can work on one log, because its replays are independent.
     let tasks: Vec<(usize, usize)> = (0..jobs.len()).flat_map(|job| (0..grid.replays).map(move |r| (job, r))).collect();
     let replays = super::in_parallel(&tasks, settings.jobs, |_, &(job, number)| {
         replay(grid, number, &jobs[job], settings, report)
     })?;
     let mut replays = replays.into_iter();
     let of_job = |job: &WhatifJob| {
-        // Consumes all results of this job, even after a failed one, because the results of the next job follow.
+        // Take all results of this job, even after a failed one, because the results of the next job follow.
         let own: Vec<Result<ReplayResult, LabError>> = replays.by_ref().take(grid.replays).collect();
         judge_log(grid, job, own.into_iter().collect::<Result<_, _>>()?, settings)
     };
     Ok(jobs.iter().map(of_job).collect())
 }
 
-/// Returns the thresholds of replay `number`, and for each combination that shares this replay, the index of the
-/// combination and the numbers of its thresholds.
+/// Returns the thresholds of replay `number`. For each combination with this replay, also returns its index and the
+/// numbers of its thresholds.
 fn watch(grid: &VariantGrid, number: usize) -> (VariantBatch, Vec<(usize, Vec<usize>)>) {
     let mut batch = VariantBatch::default();
     let own = grid.variants.iter().enumerate().filter(|(_, variant)| variant.replay == number);
@@ -152,7 +150,7 @@ fn replay(
 ) -> Result<ReplayResult, LabError> {
     let variant = grid.variants.iter().find(|variant| variant.replay == number);
     let config: &Config = &variant.ok_or("a replay without a setting")?.config;
-    // Read the truth first: if the table is unreadable, this replay, which may take hours, is skipped.
+    // Read the truth first, so that an unreadable table prevents a replay that may take hours.
     let truth = job.truth.as_deref().filter(|_| number == 0).map(Truth::read).transpose()?;
     let monitor = &config.monitor;
     let (mut batch, _) = watch(grid, number);

@@ -1,17 +1,16 @@
 //! Forecasts future rows from past rows, without future inputs.
 //!
-//! Input: a table in the order of time, with the outputs in its first columns; it may consist of independent parts. A
-//! *window* at row t contains what is known at this row: for every column, the value and the last differences
-//! ([`ForecastPlan::lags`] values per column). For every output and every horizon h, a separate Gaussian process
-//! predicts the change from row t to row t + h (a direct forecast). Errors of one step therefore do not enter the next
-//! step, and each horizon has its own noise. If the window contains no information, the forecast is the mean change,
-//! which is close to persistence (the value stays constant).
+//! Input: a table in the order of time, with the outputs in its first columns. It may consist of independent parts. A
+//! *window* at row t contains, for every column, the value and the last differences ([`ForecastPlan::lags`] values per
+//! column). For every output and every horizon h, a separate Gaussian process predicts the change from row t to row t +
+//! h (a direct forecast). Errors of one step therefore do not enter the next step, and each horizon has its own noise.
+//! If the window contains no information, the forecast is the mean change, which is close to persistence (the value
+//! stays constant).
 //!
-//! The interval is calibrated on real forecasts. The process is fitted again to the first training rows and forecasts
-//! the block of rows after them; this is repeated block by block. The ratios |error| / standard deviation of these
-//! forecasts determine the local width of the interval ([`spread`]). Leaving out single rows would not work, because
-//! windows overlap and the neighbours of a row reveal its value. No row after the origin (the end of the known rows) is
-//! used.
+//! The interval is calibrated on forecasts of known rows. The process is fitted to the first training rows and
+//! forecasts the next block of rows, and so on block by block. The ratios |error| / standard deviation determine the
+//! local width of the interval ([`spread`]). Leaving out single rows would not work, because windows overlap and the
+//! neighbours of a row reveal its value. No row after the origin (the end of the known rows) is used.
 
 mod spread;
 mod windows;
@@ -50,8 +49,8 @@ pub struct ForecastPlan {
     pub steps: usize,
     /// Share of the rows that is known: above 0, at most 1. The origin is the end of this share.
     pub origin: f64,
-    /// Maximum number of windows to which a process is fitted. The windows are selected evenly from all windows, but
-    /// not at a fixed distance, so that repeating cycles are sampled at different points.
+    /// Maximum number of windows to which a process is fitted. The windows are spread evenly but not at a fixed
+    /// distance, so that repeating cycles are sampled at different points.
     pub rows: usize,
     /// Kernel of the processes, and settings of the search for hyperparameters.
     pub settings: GprSettings,
@@ -62,7 +61,7 @@ pub struct ForecastPlan {
 pub struct TableForecast {
     /// Number of known rows.
     pub origin: usize,
-    /// Row from which the forecast at the origin is made: the last known row that has a window.
+    /// Last known row that has a window. The forecast at the origin is made from this row.
     pub from: usize,
     /// Forecasts of each output.
     pub outputs: Vec<OutputForecast>,
@@ -99,14 +98,14 @@ pub struct HorizonForecast {
     pub at_origin: Prediction,
     /// Forecasts after the origin, each with the row from which it was made.
     pub held_out: Vec<(usize, Prediction)>,
-    /// Errors of these forecasts; `None` = no forecast after the origin can be compared with a measured value.
+    /// Errors of `held_out`; `None` = no measured value is available for comparison.
     pub score: Option<PredictionScore>,
-    /// Root mean squared error of persistence (the value stays constant), over the same rows.
+    /// Root mean squared error of persistence (the value stays constant) over the same rows.
     pub persistence_rmse: Option<f64>,
 }
 
 /// Returns the horizons that get a process. If there are at most [`MAX_HORIZONS`] steps, every step is a horizon.
-/// Otherwise, at most [`MAX_HORIZONS`] horizons are spaced at constant ratios, including the first and the last step.
+/// Otherwise, at most [`MAX_HORIZONS`] horizons are spaced at constant ratios, from the first to the last step.
 pub fn horizons(steps: usize) -> Vec<usize> {
     if steps <= MAX_HORIZONS {
         return (1..=steps).collect();
@@ -154,7 +153,6 @@ pub fn run(
     Ok(TableForecast { origin, from, outputs })
 }
 
-/// Fit and forecasts of one column, `steps` rows ahead.
 struct HorizonTask<'a> {
     plan: &'a ForecastPlan,
     windows: &'a LagWindows<'a>,
@@ -182,7 +180,7 @@ impl HorizonTask<'_> {
         let fit_s = begin.elapsed().as_secs_f64();
         let predict = |rows: &[usize]| self.predict(&model, rows, &spread);
         let at_origin = predict(&[from])?.remove(0);
-        // Maximum number of windows after the origin that are scored.
+        // At most 5000 windows after the origin are scored.
         let later = chosen(&self.windows.between(self.origin - 1, usize::MAX, self.steps), 5000);
         let held_out: Vec<(usize, Prediction)> = later.iter().copied().zip(predict(&later)?).collect();
         let (score, persistence_rmse) = self.judge(&held_out);
@@ -201,15 +199,13 @@ impl HorizonTask<'_> {
         Ok((horizon, model))
     }
 
-    /// Returns the minimum number of training windows. It is larger than the number of features.
+    /// Returns the minimum number of training windows, which exceeds the number of features.
     fn fewest(&self) -> usize {
-        // Minimum if the windows have few features.
         (self.windows.width() + 2).max(20)
     }
 
-    /// Fits a process to windows whose target rows, `steps` ahead, lie before row `end`. Returns the process with the
-    /// number of windows, or `None` if there are too few windows. If `fixed` contains hyperparameters, they are used
-    /// without a search.
+    /// Fits a process to windows whose target rows (`steps` ahead) lie before row `end`. Returns the process and the
+    /// number of windows; `None` = there are too few. If `fixed` contains hyperparameters, there is no search.
     fn fitted(
         &self,
         end: usize,
@@ -229,7 +225,7 @@ impl HorizonTask<'_> {
             (settings.start, settings.max_iterations, settings.restarts) = (fixed.to_vec(), 0, 0);
         } else if !start.is_empty() {
             settings.start = start.to_vec();
-            // Maximum number of steps of a search that starts at the result of the previous horizon.
+            // The search starts at the result of the previous horizon, so 20 steps are enough.
             settings.max_iterations = settings.max_iterations.min(20);
             settings.restarts = 0;
         }
@@ -244,10 +240,10 @@ impl HorizonTask<'_> {
         let (mut judged, mut features, mut ratios) = (Vec::new(), Vec::new(), Vec::new());
         for ends in BLOCKS.windows(2) {
             let (begin, end) = (at(ends[0]).max(1), at(ends[1]));
-            // The forecast row may lie beyond the block, because a block may be shorter than the horizon.
+            // A block may be shorter than the horizon, so the forecast row may lie beyond the block.
             let mut rows = self.windows.between(begin, self.origin, self.steps);
             rows.retain(|row| *row < end);
-            // Maximum number of windows of a block that are used for the calibration.
+            // At most 750 windows of a block are used for the calibration.
             let rows = chosen(&rows, 750);
             if rows.is_empty() {
                 continue;
@@ -264,7 +260,7 @@ impl HorizonTask<'_> {
         Ok(Spread::new(judged, &features, ratios, self.steps + self.plan.lags))
     }
 
-    /// Returns the forecasts made at these rows: predictions of the value, not of its change.
+    /// Returns the forecasts of the value (not of its change) from these rows.
     fn predict(&self, model: &Model, rows: &[usize], spread: &Spread) -> Result<Vec<Prediction>, LabError> {
         if rows.is_empty() {
             return Ok(Vec::new());
@@ -315,16 +311,15 @@ pub fn write(path: &Path, data: &ColumnTable, forecast: &TableForecast) -> Resul
     write_csv(path, heads.map(str::to_owned).to_vec(), rows)
 }
 
-/// Divides the rows into equal stretches and returns a row of each, at most `most` different rows. The position of this
-/// row differs between stretches. If rows repeat, for example in cycles, a fixed position would always select rows of the
-/// same phase.
+/// Returns at most `most` rows: one row from each of equal sections. The position of the row in its section varies,
+/// because a fixed position would always select the same phase of repeating rows.
 fn chosen(all: &[usize], most: usize) -> Vec<usize> {
     let count = all.len().min(most);
-    // The fractional parts of multiples of the golden ratio fill a stretch evenly and never repeat.
+    // The fractional parts of multiples of the golden ratio fill an interval evenly and never repeat.
     let place = |k: usize| if count == all.len() { 0.0 } else { (k as f64 * 0.618_033_988_749_894_9).fract() };
     let at = |k: usize| ((k as f64 + place(k)) * all.len() as f64 / count as f64) as usize;
     let mut rows: Vec<usize> = (0..count).map(|k| all[at(k).min(all.len() - 1)]).collect();
-    // Neighbouring positions can fall on one row if a stretch has fewer than two rows.
+    // Neighbouring positions can select the same row if a section has fewer than two rows.
     rows.dedup();
     rows
 }

@@ -1,4 +1,4 @@
-//! Draws pictures of regressions (predicted over measured values, a stretch of rows with its interval, the error of
+//! Draws pictures of regressions (predicted over measured values, a section of rows with its interval, the error of
 //! every row) and of forecasts (the fan at the origin, error and coverage over the horizon).
 
 use std::path::Path;
@@ -7,7 +7,7 @@ use super::forecast::{HorizonForecast, OutputForecast, TableForecast};
 use super::{ColumnTable, CrossValidation, table};
 use crate::chart::{self, Axis, Chart, Ink, Layer, Picture, PlotError, Point, Shape};
 
-/// Number of rows of the stretch that is drawn with its interval: few enough that single rows are visible.
+/// Number of rows of the section that is drawn with its interval. Single rows remain visible.
 const STRETCH: usize = 150;
 
 /// Draws the cross-validation of every kernel as SVG files.
@@ -45,7 +45,7 @@ fn write_charts(folder: &Path, name: &str, charts: Vec<Chart>) -> Result<(), Plo
     chart::write_stack(&folder.join(format!("{name}.svg")), &pictures)
 }
 
-/// Makes a file name from a text: its words, joined by `_`. If the text contains `*`, `_product` is appended.
+/// Makes a file name from the words of a text, joined by `_`. If the text contains `*`, `_product` is appended.
 fn slug(text: &str) -> String {
     let words: Vec<&str> = text.split(|c: char| !c.is_ascii_alphanumeric()).filter(|word| !word.is_empty()).collect();
     let joined = match text.contains('*') {
@@ -65,7 +65,7 @@ fn band(all: impl Iterator<Item = (f64, f64, f64)>) -> Layer {
 }
 
 fn scatter(validated: &CrossValidation, truth: &[f64], output: &str) -> Chart {
-    // Maximum number of points in the picture of predicted over measured values.
+    // At most 3000 points are drawn.
     let every = truth.len().div_ceil(3000).max(1);
     let pairs = truth.iter().zip(&validated.folds.predictions).step_by(every);
     let mut pairs: Vec<(f64, f64)> = pairs.map(|(y, p)| (*y, p.mean)).collect();
@@ -131,7 +131,7 @@ fn fan(data: &ColumnTable, forecast: &TableForecast, output: &OutputForecast) ->
     let most = output.horizons.last().map_or(1, |horizon| horizon.steps);
     let from = forecast.from;
     let value = |row: usize| data.row(row)[output.column];
-    // Smallest number of rows before the origin that a fan shows.
+    // The fan shows at least 60 rows before the origin.
     let rows = from.saturating_sub((2 * most).max(60))..(from + most + 1).min(data.len());
     let x = |row: usize| row as f64 - from as f64;
     let at = |horizon: &HorizonForecast| horizon.steps as f64;
@@ -179,7 +179,7 @@ fn coverage(output: &OutputForecast) -> Chart {
     Chart::new(title, "rows ahead", Axis::number("inside, %").within(0.0, 100.0), layers)
 }
 
-/// Draws the forecasts of the last horizon that has a score, and the measured values, at the rows that were forecast.
+/// Draws the forecasts of the last scored horizon, with the measured values, at the forecast rows.
 fn held_out(data: &ColumnTable, output: &OutputForecast) -> Chart {
     let Some(horizon) = output.horizons.iter().rfind(|h| h.score.is_some()) else { return Chart::default() };
     let for_row = |row: usize| (row + horizon.steps) as f64 + 1.0;

@@ -1,27 +1,27 @@
-//! Reads columns of CSV files by name, for regressions. Any column may be an output or an input.
+//! Reads columns of CSV files by name, for regressions.
 //!
-//! Input: CSV (plain, gzip or zstd) with one header line and numbers in the requested columns. Output: the values of
-//! these columns, row by row, with the file and line of each row. An empty field or NaN is a missing value.
-//! [`MissingPolicy`] decides what a missing value in a required column causes: an error that names the place, or the
-//! row is left out and counted. Any other field that is not a finite number is always an error.
+//! Input: CSV (plain, gzip or zstd) with one header line. An empty field or NaN is a missing value. In a required
+//! column, [`MissingPolicy`] decides whether it is an error or the row is left out and counted. Any other field that is
+//! not a finite number is an error.
 
 use std::path::{Path, PathBuf};
 
 use crate::error::LabError;
 use crate::io::table::{PART_COLUMNS, Row, Table as CsvTable, TableError};
 
-/// Units that may end the name of a column. For example, the name `voltage` matches the column `voltage_v`.
+/// Units at the end of a column name that may be omitted. For example, the name `voltage` matches the column
+/// `voltage_v`.
 const UNITS: [&str; 36] = [
     "a", "ma", "ah", "mah", "v", "mv", "w", "kw", "wh", "kwh", "c", "k", "f", "s", "ms", "us", "ns", "min", "h", "d",
     "days", "cycles", "hz", "ohm", "mohm", "percent", "pct", "ppm", "kg", "m", "mm", "pa", "bar", "n", "nm", "rpm",
 ];
-/// Maximum number of rows of a regression. So many rows need several gigabytes of memory.
+/// Maximum number of rows of a regression. More rows need several gigabytes of memory.
 const MAX_ROWS: usize = 5_000_000;
 
-/// What happens to a row in which a required value is missing.
+/// Treatment of rows in which a required value is missing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MissingPolicy {
-    /// An error that names file and line.
+    /// Reading fails with an error that names file and line.
     Rejected,
     /// The row is left out and counted.
     Skipped,
@@ -32,7 +32,7 @@ pub enum MissingPolicy {
 pub struct ColumnSelection<'a> {
     /// Required columns, by name with or without the unit.
     pub columns: &'a [String],
-    /// Optional columns. The column or any of its values may be missing (NaN).
+    /// Optional columns. The column, or values in it, may be missing (NaN).
     pub optional: &'a [String],
     /// Treatment of rows in which a required value is missing.
     pub missing: MissingPolicy,
@@ -62,13 +62,13 @@ impl PartColumn {
 /// Columns of one or more files. The rows of the files follow each other.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct ColumnTable {
-    /// Full names of the columns in the requested order. An optional column that is missing has the requested name.
+    /// Full names of the columns in the requested order. A missing optional column has the requested name.
     pub names: Vec<String>,
     /// Values, row by row.
     pub values: Vec<f64>,
     /// Line of each row in its file.
     pub lines: Vec<u64>,
-    /// Each file with the total number of rows of the table up to the end of this file.
+    /// Each file with the number of the table's rows up to the end of this file.
     pub files: Vec<(PathBuf, usize)>,
     /// Number of rows left out because a value is missing.
     pub skipped: usize,
@@ -83,7 +83,7 @@ impl ColumnTable {
     ///
     /// # Errors
     /// A file cannot be read, a column is unknown or ambiguous, a value is missing or not a number, or there are too
-    /// many rows. The error states file, line, column, what was found and what is allowed.
+    /// many rows.
     pub fn read(paths: &[PathBuf], wanted: &ColumnSelection<'_>, part: &PartColumn) -> Result<Self, LabError> {
         let mut table = Self { has: vec![true; wanted.optional.len()], ..Self::default() };
         for path in paths {
@@ -94,7 +94,7 @@ impl ColumnTable {
         Ok(table)
     }
 
-    /// If the default part column changes in every row, ignores the column, because it only counts the rows.
+    /// Ignores the default part column if it changes in every row, because it then only counts the rows.
     fn ignore_row_counter(&mut self, part: &PartColumn) {
         if *part == PartColumn::Default && self.parts.len() == self.len() {
             let begins = [0].into_iter().chain(self.files.iter().map(|(_, end)| *end));
@@ -139,7 +139,7 @@ impl ColumnTable {
         format!("{}:{}", self.file_of(row).display(), self.lines[row])
     }
 
-    /// Returns the number of the row `steps` after this one; `None` = it is not in the same part.
+    /// Returns the number of the row `steps` after this row; `None` = that row is not in the same part.
     pub fn after(&self, row: usize, steps: usize) -> Option<usize> {
         let at = self.parts.partition_point(|begin| *begin <= row);
         let end = self.parts.get(at).copied().unwrap_or(self.len());
@@ -216,7 +216,7 @@ impl ColumnTable {
     }
 }
 
-/// Returns the values of a row; `None` = a required value is missing and such rows are left out.
+/// Returns the values of a row; `None` = the row is left out because a required value is missing.
 fn row_values(
     row: &Row<'_>,
     columns: &[Option<usize>],
@@ -236,7 +236,6 @@ fn row_values(
     Ok(Some(values))
 }
 
-/// Reads a number; an empty field becomes NaN.
 fn number(row: &Row<'_>, column: usize) -> Result<f64, TableError> {
     let text = row.text(column);
     if text.is_empty() {
@@ -246,7 +245,6 @@ fn number(row: &Row<'_>, column: usize) -> Result<f64, TableError> {
     number.ok_or_else(|| row.fault(column, "a finite number"))
 }
 
-/// Finds a column by its name, with or without the unit.
 fn find(header: &[String], name: &str) -> Result<usize, String> {
     let all = |fits: &dyn Fn(&str) -> bool| -> Vec<usize> {
         header.iter().enumerate().filter(|(_, column)| fits(column)).map(|(at, _)| at).collect()
@@ -255,7 +253,7 @@ fn find(header: &[String], name: &str) -> Result<usize, String> {
     let found = if exact.is_empty() { all(&|column| stem(column) == Some(name)) } else { exact };
     let list = |columns: &mut dyn Iterator<Item = &String>| {
         let names: Vec<&str> = columns.map(String::as_str).collect();
-        // Maximum number of column names in an error.
+        // An error lists at most 40 column names.
         let more = names.len().saturating_sub(40);
         let shown = names[..names.len() - more].join(", ");
         if more > 0 { format!("{shown} and {more} more") } else { shown }
@@ -270,7 +268,6 @@ fn find(header: &[String], name: &str) -> Result<usize, String> {
     }
 }
 
-/// Returns the name of a column without its unit.
 fn stem(column: &str) -> Option<&str> {
     split(column).map(|(stem, _)| stem)
 }

@@ -1,8 +1,7 @@
-//! Defines a regression model that stores the names of its columns. The model is trained on a table, saved, loaded, and
-//! applied to other files.
+//! Defines a regression model that stores the names of its columns.
 //!
-//! The file has one line of JSON with the names of the columns, followed by the two lines of the model itself. These
-//! two lines have a checksum (see [`Model`]).
+//! The file has one line of JSON with the names of the columns, followed by the two lines of [`Model`], which have a
+//! checksum.
 
 use std::path::Path;
 
@@ -15,11 +14,10 @@ use crate::io::json::json_fault;
 use crate::regress::{GprSettings, Model, Prediction, ProgressCallback, TrainingRows, fit};
 use packwatch_host::bounded_file;
 
-/// Format name in the first line.
 const FORMAT: &str = "packwatch gpr";
-/// Version of the format; other versions are rejected.
+/// Version of the format. Other versions are rejected.
 const VERSION: u32 = 1;
-/// Maximum size of a file, bytes; the largest model is smaller.
+/// Maximum size of a file (bytes). The largest model is smaller.
 const MAX_BYTES: u64 = 1 << 32;
 
 /// A fitted model and the names of its columns.
@@ -114,8 +112,7 @@ impl TrainedModel {
     }
 }
 
-/// Writes predictions of the rows of a table. The last column of the table is the output; its value is NaN if it is
-/// unknown.
+/// Writes predictions of the rows of a table. The last column is the output; NaN = unknown.
 ///
 /// # Errors
 /// The file cannot be written.

@@ -2,11 +2,10 @@
 //! has no charge counter.
 //!
 //! The SOC is anchored at two points. At the end of every full charge, where the charger stops, the SOC is 1. At the
-//! knee, where a discharge falls through a fixed voltage ([`KNEE_SHARE`]), the SOC is the same in every discharge,
-//! because the voltage falls fastest there and little charge is left. With these anchors, neither the fade from cycle
-//! to cycle nor the gain error of the charger's current distorts the curves. When the voltage under load reaches the
-//! cut-off, the SOC is assumed to be [`SOC_LEFT`] on average. Half-cycles before the first discharge start at an
-//! unknown SOC and are left out.
+//! knee, a discharge falls through a fixed voltage ([`KNEE_SHARE`]). The SOC at the knee is the same in every
+//! discharge, because the voltage falls fastest there and little charge is left. These anchors prevent capacity fade
+//! and the gain error of the charger's current from distorting the curves. At the cut-off under load, the mean SOC is
+//! assumed to be [`SOC_LEFT`]. Half-cycles before the first discharge start at an unknown SOC and are left out.
 
 use super::{MeasuredPart, charge_ah};
 use crate::filter::median;
@@ -15,13 +14,13 @@ use crate::filter::median;
 pub(crate) const SOC_LEFT: f64 = 0.045;
 /// Voltage of the knee, as a share of the range from the lowest to the highest voltage: 3.0 V for 2.7 to 4.2 V.
 const KNEE_SHARE: f64 = 0.2;
-/// Current above which a row counts as under load, as a share of the median current of the discharge.
+/// A row is under load above this share of the median current of the discharge.
 const LOADED_SHARE: f64 = 0.5;
-/// If the current changes by more than this between two rows (A) per Ah of capacity, the voltage and the current of the
-/// row may belong to different instants.
+/// If the current changes by more than this between two rows (A per Ah of capacity), the row's voltage and current may
+/// belong to different instants.
 const STEP_PER_AH: f64 = 0.25;
-/// Below this SOC, rows of a discharge without load are not judged, because the voltage recovers more slowly than any
-/// branch of the model.
+/// Below this SOC, discharge rows without load do not count in the fit, because the voltage recovers more slowly than
+/// any branch of the model.
 const RECOVERY_SOC: f64 = 0.5;
 
 /// A half-cycle with its SOC.
@@ -33,12 +32,12 @@ pub struct AnchoredHalfCycle {
     pub current_a: Vec<f64>,
     /// SOC of each row.
     pub soc: Vec<f64>,
-    /// For each row, whether its voltage is judged.
+    /// For each row, whether its voltage counts in the fit.
     pub judged: Vec<bool>,
 }
 
-/// A charge counts as full if the ampere-hours charged, divided by the ampere-hours missing before it, are in this
-/// range. Other charges are left out.
+/// A charge is full if the charged ampere-hours, divided by the ampere-hours that were missing before, are in this
+/// range. Aborted charges and charges with too few samples are left out.
 const FULL_CHARGE: std::ops::RangeInclusive<f64> = 0.8..=1.25;
 
 /// Charge from the start of a discharge to its knee and to its cut-off (Ah).
@@ -47,8 +46,8 @@ struct Marks {
     cut_off_ah: f64,
 }
 
-/// Returns the capacity (Ah, mean over the discharges), and the half-cycles from the first discharge on, each with its
-/// SOC. Charges that are not full are left out.
+/// Returns the capacity (Ah, mean over the discharges), and the SOC of the half-cycles from the first discharge on.
+/// Charges that are not full are left out.
 ///
 /// # Errors
 /// The cycles contain no discharge, or a discharge has no knee.
@@ -84,7 +83,6 @@ pub fn anchor(cycles: &[MeasuredPart], voltage_v: (f64, f64)) -> Result<(f64, Ve
             out_ah.iter().map(|ah| 1.0 - ah * per_ah).collect()
         } else {
             let all_ah = out_ah[out_ah.len() - 1];
-            // Skip charges that do not fill the cell, such as aborted charges, and charges with too few samples.
             if !FULL_CHARGE.contains(&(-all_ah / ((1.0 - left) * capacity_ah))) {
                 continue;
             }
@@ -111,8 +109,8 @@ fn marks(cycle: &MeasuredPart, knee_v: f64, cut_off_v: f64) -> Option<Marks> {
     Some(Marks { knee_ah: crossing(knee_v)?, cut_off_ah: crossing(cut_off_v).unwrap_or(last_ah) })
 }
 
-/// Sets the short loads with which chargers test themselves to 0. These loads move almost no charge. Because the rows
-/// are seconds apart, an integral over the rows would count too much charge.
+/// Sets the current of short load pulses to 0. Chargers test themselves with such pulses. The pulses move almost no
+/// charge, but an integral over rows that are seconds apart would count too much.
 fn without_load_pulses(cycle: &MeasuredPart, capacity_ah: f64) -> Vec<f64> {
     let pulse = |i: f64| !cycle.is_discharge() && i > STEP_PER_AH * capacity_ah;
     cycle.current_a.iter().map(|&i| if pulse(i) { 0.0 } else { i }).collect()

@@ -1,41 +1,39 @@
-//! Identifies the electrodes of a new cell from its open-circuit curve: materials, and lithium contents of the empty
-//! and of the full cell.
+//! Identifies the electrodes of a new cell from its open-circuit curve: the materials, and their lithium contents in
+//! the empty and in the full cell.
 //!
 //! Input: OCV (V) over SOC (fraction). Output: the pair of materials that fits best, with the residual (V). For each
-//! pair, damped Gauss-Newton steps fit the four lithium contents (of two electrodes, at empty and at full). A curve
-//! without steps does not determine the size of an electrode, so a weak prior keeps the contents near those of
-//! commercial cells. On identifiability: Lee et al., J. Electrochem. Soc. 167 (2020) 090509.
+//! pair, damped Gauss-Newton steps fit the four lithium contents. A curve without steps does not determine the size of
+//! an electrode, so a weak prior keeps the contents near those of commercial cells. On identifiability: Lee et al., J.
+//! Electrochem. Soc. 167 (2020) 090509.
 
 use nalgebra::{Matrix4, Vector4};
 
 use crate::cell::{Electrodes, NegativeMaterial, PositiveMaterial};
 use crate::filter::levenberg_marquardt::{Damping, minimise};
 
-/// Number of SOC values at which the curves are compared.
 const POINTS: u32 = 51;
-/// Standard deviation of a real cell's voltage from the voltage that the library gives (V). Materials with the same
-/// name differ.
+/// Standard deviation of a real cell's voltage from the library's voltage (V). Materials with the same name differ.
 const MATERIAL_V: f64 = 0.01;
-/// The same standard deviation below [`LOW_SOC`], V. Curves fall steeply there.
+/// The same standard deviation below [`LOW_SOC`], where curves fall steeply (V).
 const LOW_SOC_V: f64 = 0.03;
 /// Upper end of the steep part of the curves, SOC.
 const LOW_SOC: f64 = 0.05;
 /// Prior mean and standard deviation of the lithium contents [negative empty, negative full, positive empty, positive
 /// full].
 const PRIOR: [(f64, f64); 4] = [(0.02, 0.03), (0.88, 0.12), (0.92, 0.10), (0.32, 0.12)];
-/// Bounds of the same contents.
+/// Bounds of the lithium contents, in the order of [`PRIOR`].
 const BOUNDS: [(f64, f64); 4] = [(0.0005, 0.25), (0.4, 0.999), (0.55, 0.9995), (0.005, 0.6)];
-/// Maximum number of steps of the fit; it converges within 20.
+/// Maximum number of steps. The fit converges within 20.
 const STEPS: usize = 60;
 const DAMPING: Damping =
     Damping { first: 1e-2, fall: 0.3, fall_after_growth: 0.3, growth: 10.0, least: 1e-9, most: f64::INFINITY };
-/// Largest accepted residual (V). A larger residual means that the library lacks the materials of the cell. For curves
-/// of published cells, the residual is at most 5 mV with their own materials, and above 10 mV with most other
-/// materials. Wrong materials can also fit within this limit. They can predict ageing better or worse than the
-/// alternative, a shift of the curve along the SOC. The limit is therefore a compromise.
+/// Largest accepted residual (V). Above it, the library lacks the cell's materials. Published cells fit within 5 mV
+/// with their own materials. With most other materials, the residual exceeds 10 mV. The limit is a compromise, because
+/// wrong materials can also fit. The ageing that wrong materials predict can be better or worse than a shift of the
+/// curve along the SOC.
 pub const MAX_RESIDUAL_V: f64 = 0.008;
 
-/// The electrodes found.
+/// The fitted electrodes and their residual.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FittedElectrodes {
     /// Materials and contents.
@@ -44,8 +42,7 @@ pub struct FittedElectrodes {
     pub residual_v: f64,
 }
 
-/// Returns the pair of materials that fits the curve best; `None` = the residual of this pair exceeds
-/// [`MAX_RESIDUAL_V`].
+/// Returns the pair of materials that fits the curve best; `None` = its residual exceeds [`MAX_RESIDUAL_V`].
 pub fn identify(ocv_v: impl Fn(f64) -> f64) -> Option<FittedElectrodes> {
     let curve: Vec<(f64, f64)> =
         (0..POINTS).map(|k| f64::from(k) / f64::from(POINTS - 1)).map(|soc| (soc, ocv_v(soc))).collect();
@@ -70,7 +67,6 @@ fn electrodes((positive, negative): (PositiveMaterial, NegativeMaterial), conten
     }
 }
 
-/// Returns the best contents for a pair of materials, and their cost.
 fn fit_pair(curve: &[(f64, f64)], pair: (PositiveMaterial, NegativeMaterial)) -> (Electrodes, f64) {
     let residuals = |x: &Vector4<f64>| {
         let cell = electrodes(pair, x);

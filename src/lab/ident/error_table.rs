@@ -1,14 +1,14 @@
 //! Estimates the error of the fitted model over SOC and temperature: the root mean square of the voltage errors, each
 //! averaged over a block of [`BLOCK_S`].
 //!
-//! Errors of a model are correlated over minutes, so they are averaged over blocks. A block is weighted by the charge
-//! that was moved in it, and is shared among the nodes around it. If little charge was moved near a node, the error of
-//! the node follows the mean error at its temperature.
+//! Blocks are used because errors of a model are correlated over minutes. A block is weighted by the charge moved in
+//! it, and is shared among the nodes around it. If little charge was moved near a node, its error follows the mean
+//! error at its temperature.
 //!
 //! The residuals of a fit understate the error on a new drive. Therefore the variance is multiplied by 1 + 3 / n, where
-//! n is the number of files that visit the node. A pulse test or slow test counts as 0.3 of a file, because it says
-//! little about a drive. The life of an ageing cell counts as one file, no matter how many cycles it has. A temperature
-//! without data takes the errors of the nearest temperature with data, scaled by a power of the Arrhenius factor.
+//! n is the number of files with data near the node. A pulse test or slow test counts as 0.3 of a file, because it
+//! differs from a drive. The life of an ageing cell counts as one file. A temperature without data gets the errors of
+//! the nearest temperature with data, scaled by a power of the Arrhenius factor.
 
 use std::collections::BTreeMap;
 
@@ -17,19 +17,17 @@ use super::grid::{Grid, arrhenius};
 use super::pass::{COLD_POWER, residuals};
 use super::record::Record;
 
-/// Length of a block (s).
 const BLOCK_S: f64 = 100.0;
 /// Upper limit of the error of a block (V); also the error if no temperature has data.
 const MOST_V: f64 = 0.1;
-/// The error of a node also includes the mean error at its temperature. The mean has the same weight as data that moved
-/// this charge, as SOC.
+/// In the error of each node, the mean error at the node's temperature has the weight of data that move this charge (as
+/// SOC).
 const LEAN_SOC: f64 = 1.0;
 /// Growth of the variance on data outside the fit: 1 + this constant / number of files.
 const UNSEEN: f64 = 3.0;
-/// A file visits a node if more than this charge, as SOC, was moved near the node.
+/// A file has data near a node if more than this charge, as SOC, was moved there.
 const VISIT_SOC: f64 = 0.005;
 
-/// Sums per node.
 struct NodeSums {
     square: Vec<f64>,
     weight: Vec<f64>,
@@ -89,7 +87,6 @@ fn add_record(sums: &mut NodeSums, fit: &FittedTables, record: &Record, share: f
     block.close(sums, &fit.grid, share);
 }
 
-/// Weighted sums over one block.
 #[derive(Default)]
 struct ErrorBlock {
     error: f64,
@@ -115,7 +112,6 @@ impl ErrorBlock {
     }
 }
 
-/// Returns the errors of one temperature; `None` = no file visits its nodes.
 fn row(sums: &NodeSums, t: usize, columns: usize) -> Option<Vec<f64>> {
     let range = t * columns..(t + 1) * columns;
     let weight: f64 = sums.weight[range.clone()].iter().sum();
@@ -127,13 +123,12 @@ fn row(sums: &NodeSums, t: usize, columns: usize) -> Option<Vec<f64>> {
     let of_node = |node: usize| {
         let files = if sums.files[node] > 0.0 { sums.files[node] } else { most_files };
         let variance = (sums.square[node] + LEAN_SOC * mean) / (sums.weight[node] + LEAN_SOC);
-        // Smallest error that a model is assumed to have (V).
+        // A model's error is assumed to be at least 1 mV.
         (variance * (1.0 + UNSEEN / files)).sqrt().max(0.001)
     };
     Some(range.map(of_node).collect())
 }
 
-/// Fills rows without data from the nearest row with data.
 fn fill(grid: &Grid, rows: &[Option<Vec<f64>>]) -> Vec<f64> {
     let temperatures = &grid.temperature_c;
     let known = || rows.iter().zip(temperatures).filter_map(|(row, &t)| row.as_ref().map(|row| (row, t)));

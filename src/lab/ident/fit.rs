@@ -1,4 +1,4 @@
-//! Runs a whole fit of a cell model. Sets starting values and prior, and passes over all records in parallel until the
+//! Runs a whole fit of a cell model: sets starting values and prior, and passes over all records in parallel until the
 //! cost stops falling. The result also contains the residuals, and the seconds of data near each node.
 
 use rayon::prelude::*;
@@ -11,12 +11,12 @@ use super::record::Record;
 use super::solve::{Space, minimise};
 use crate::filter::median;
 
-/// Number of groups of records. Each group is summed separately, and then the sums of the groups are added in order.
-/// The result therefore does not depend on the number of cores.
+/// Number of groups of records. Each group is summed separately, and the sums are added in the order of the groups, so
+/// that the result does not depend on the number of cores.
 const GROUPS: usize = 4;
-/// Smallest number of judged rows for a fit.
+/// Smallest number of rows that count in a fit.
 pub const MIN_ROWS: usize = 50;
-/// A node with fewer seconds of data nearby is reported as not supported by data.
+/// A node with fewer seconds of data nearby is reported as unsupported.
 pub const SUPPORTED_S: f64 = 30.0;
 /// A time constant stays within this factor of its starting value.
 const TAU_FACTOR: f64 = 5.0;
@@ -59,17 +59,17 @@ pub struct FitSettings {
 /// Error statistics of one record.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Residual {
-    /// Seconds that the judged rows represent.
+    /// Seconds that the counted rows represent.
     pub seconds: f64,
     /// Root mean square (V), weighted by time.
     pub rmse_v: f64,
-    /// Mean residual (measured minus model) (V).
+    /// Mean of measured minus modelled voltage (V).
     pub mean_v: f64,
     /// Residual with the largest absolute value (V).
     pub worst_v: f64,
 }
 
-/// A fitted set of tables.
+/// Result of a fit.
 #[derive(Debug, Clone)]
 pub struct FittedTables {
     /// Breakpoints.
@@ -86,9 +86,7 @@ pub struct FittedTables {
     pub converged: bool,
 }
 
-/// Error: the cost is not finite at the starting values.
 const NOT_FINITE: &str = "the data or the starting values are not finite: two slow tests at one temperature, or a value that is not a number";
-/// Error: the current never changes enough to determine a resistance.
 const NO_EXCITATION: &str = "the current does not change, so no resistance can be separated from the open-circuit voltage; add a file with pulses or a drive";
 
 /// Fits tables to `records`; `scale` is the weight of each record. `progress` receives the pass number and the cost.
@@ -135,8 +133,8 @@ pub fn fit(
 
 type Group<'a> = Vec<(&'a Record, f64)>;
 
-/// Distributes the records over at most [`GROUPS`] groups. The longest record comes first, and each record goes to the
-/// group with the fewest rows. All groups then take about equally long.
+/// Distributes the records over at most [`GROUPS`] groups, the longest first. Each record goes to the group with the
+/// fewest rows, so that all groups take about equally long.
 fn groups<'a>(records: &'a [Record], scale: &[f64]) -> Vec<Group<'a>> {
     let mut order: Vec<usize> = (0..records.len()).collect();
     order.sort_by_key(|&i| std::cmp::Reverse(records[i].rows.len()));
@@ -159,7 +157,6 @@ fn sum_of_groups(groups: &[Group<'_>], layout: &Layout, theta: &[f64]) -> Normal
         }
         normal
     };
-    // The sums are added in the order of the groups, so the result does not depend on the threads.
     let sums: Vec<NormalEquations> = groups.par_iter().map(of_group).collect();
     sums.iter().fold(NormalEquations::new(layout.len()), |mut sum, group| {
         sum.add_all(group);
@@ -167,8 +164,8 @@ fn sum_of_groups(groups: &[Group<'_>], layout: &Layout, theta: &[f64]) -> Normal
     })
 }
 
-/// Returns the starting values: the OCV of the slow test or a straight line, resistances from steps of the current, and
-/// the time constants of the settings.
+/// Returns the starting values: the OCV of the slow test or a straight line, resistances from current steps, and the
+/// time constants of the settings.
 fn start(settings: &FitSettings, layout: &Layout, records: &[Record]) -> Result<Vec<f64>, String> {
     let grid = &settings.grid;
     let mut theta = match settings.ocv.is_empty() {
@@ -190,8 +187,8 @@ fn straight_ocv(settings: &FitSettings) -> Vec<f64> {
     settings.grid.soc.iter().map(|s| low + s * (high - low)).collect()
 }
 
-/// Returns the OCV at every node from slow tests. Between the temperatures of two tests, the OCV is interpolated
-/// linearly. Outside, the nearest test applies.
+/// Returns the OCV at every node from slow tests. It is linear between the temperatures of two tests. Outside these
+/// temperatures, the nearest test applies.
 pub fn ocv_nodes(grid: &Grid, curves: &[OcvCurve]) -> Vec<f64> {
     let temperatures: Vec<f64> = curves.iter().map(|c| c.temperature_c).collect();
     let at = |t: f64, soc: f64| {
@@ -205,8 +202,8 @@ pub fn ocv_nodes(grid: &Grid, curves: &[OcvCurve]) -> Vec<f64> {
         .collect()
 }
 
-/// Returns the voltage of a curve. Below the SOC at which a test in the cold ended, its curve continues with the shape
-/// of the next warmer curve.
+/// Returns the voltage of a curve. Below the SOC at which a cold test ended, the curve continues with the shape of the
+/// next warmer curve.
 fn curve_at(curves: &[OcvCurve], which: usize, soc: f64) -> f64 {
     let curve = &curves[which];
     let end = curve.soc[0];
@@ -216,8 +213,6 @@ fn curve_at(curves: &[OcvCurve], which: usize, soc: f64) -> f64 {
     curve.voltage_v[0] + curve_at(curves, which + 1, soc) - curve_at(curves, which + 1, end)
 }
 
-/// Returns the median resistance at 25 degrees C from steps of the current between rows; `None` = the current has no
-/// usable step.
 fn resistance_of_steps(records: &[Record]) -> Option<f64> {
     let mut found = Vec::new();
     for record in records {
@@ -317,14 +312,14 @@ impl ResidualSums {
 }
 
 impl FittedTables {
-    /// Returns temperature and SOC of the nodes that are not supported by data.
+    /// Returns temperature and SOC of the nodes with less than [`SUPPORTED_S`] of data.
     pub fn unsupported(&self) -> Vec<(f64, f64)> {
         let columns = self.grid.soc.len();
         let weak = self.visits_s.iter().enumerate().filter(|(_, seconds)| **seconds < SUPPORTED_S);
         weak.map(|(node, _)| (self.grid.temperature_c[node / columns], self.grid.soc[node % columns])).collect()
     }
 
-    /// Returns the open-circuit voltage averaged over the SOC range and the temperatures (V).
+    /// Returns the open-circuit voltage averaged over SOC and temperature (V).
     pub fn mean_ocv_v(&self) -> f64 {
         let of_row = |row: &[f64]| -> f64 {
             let pairs = row.windows(2).zip(self.grid.soc.windows(2));

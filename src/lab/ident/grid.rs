@@ -1,9 +1,9 @@
 //! Defines the grid of the tables, and finds the position of a point (SOC, temperature) in this grid.
 //!
-//! The rules are the same as in [`CellModel::grid_position`](crate::cell::CellModel::grid_position). Along SOC, all
-//! values are linear. Below 0 and above 1, the OCV is extrapolated and the other values stay constant. Along
+//! The rules are the same as in [`CellModel::grid_position`](crate::cell::CellModel::grid_position). All values are
+//! linear along SOC. Below 0 and above 1, the OCV is extrapolated and the other values stay constant. Along
 //! temperature, the OCV and the time constants are linear, and resistances follow Arrhenius' law. Outside the
-//! temperature range, the values of the nearest temperature apply.
+//! temperature range, the nearest temperature applies.
 
 pub use crate::cell::arrhenius;
 use crate::filter::{self, locate};
@@ -17,7 +17,7 @@ pub struct Grid {
     pub temperature_c: Vec<f64>,
 }
 
-/// The two SOC columns and two temperature rows around one point, with the weights of the upper column and row.
+/// Two SOC columns and two temperature rows around a point, with the weights of the upper column and row.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GridPoint {
     /// Lower SOC column.
@@ -28,13 +28,13 @@ pub struct GridPoint {
     pub along_s: f64,
     /// Weight of the upper column for the OCV; it may be outside [0, 1].
     pub beyond_s: f64,
-    /// Weight of the upper row for the OCV and the time constants, in [0, 1]; 0 with a single temperature.
+    /// Weight of the upper row for the OCV and the time constants, in [0, 1]; 0 if there is only one temperature.
     pub along_t: f64,
     /// Weight of the upper row for resistances.
     pub warped_t: f64,
 }
 
-/// Nodes with their weights; the first `len` are valid.
+/// Nodes with their weights. Only the first `len` entries are valid.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Corners {
     /// Node numbers: temperature row times number of columns, plus column.

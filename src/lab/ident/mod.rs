@@ -1,10 +1,9 @@
-//! Fits cell models to measured data ("Battery Predictions for Electronic Prognostics", section 3.3.2). This module
-//! only computes: it reads no files and prints nothing.
+//! Fits cell models to measured data ("Battery Predictions for Electronic Prognostics", section 3.3.2).
 //!
 //! Data flow of a fit:
 //!
 //! 1. [`anchor`] determines the SOC of every raw row of a file.
-//! 2. [`record`] joins raw rows into coarser rows, and gives each a weight and its position in the tables.
+//! 2. [`record`] joins raw rows into coarser rows. Each row gets a weight and a position in the tables.
 //! 3. [`pass`] computes the residuals, and their exact Jacobian from recursive sensitivities.
 //! 4. [`prior`] adds the prior, which keeps the tables smooth.
 //! 5. [`solve`] minimises the cost (projected Levenberg-Marquardt).
@@ -30,7 +29,7 @@ pub mod unanchored;
 /// Consecutive rows whose time does not restart.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct MeasuredPart {
-    /// Value of the part column (`cycle`, `segment` or `ref`); empty if the file has no such column.
+    /// Value of the column that numbers the parts (`cycle`, `segment` or `ref`); empty if the file has no such column.
     pub key: String,
     /// Value of the `type` column in the first row, `charge` or `discharge`; empty without that column.
     pub kind: String,
@@ -42,14 +41,13 @@ pub struct MeasuredPart {
     pub voltage_v: Vec<f64>,
     /// Cell temperature (degrees C); NaN where not measured.
     pub temperature_c: Vec<f64>,
-    /// Counter of the cycler (Ah) taken out; NaN where not recorded.
+    /// Charge taken out according to the cycler's counter (Ah); NaN where not recorded.
     pub discharged_ah: Vec<f64>,
     /// State of charge, fraction; empty until determined.
     pub soc: Vec<f64>,
 }
 
 impl MeasuredPart {
-    /// Whether the column `type` says that this part is a discharge.
     pub(crate) fn is_discharge(&self) -> bool {
         self.kind == "discharge"
     }
@@ -59,7 +57,6 @@ impl MeasuredPart {
         self.time_s.len()
     }
 
-    /// Adds a row.
     pub(crate) fn push(&mut self, time_s: f64, current_a: f64, voltage_v: f64, temperature_c: f64, discharged_ah: f64) {
         self.time_s.push(time_s);
         self.current_a.push(current_a);
@@ -68,13 +65,13 @@ impl MeasuredPart {
         self.discharged_ah.push(discharged_ah);
     }
 
-    /// After the load, some testers hold the lowest voltage while the current falls. Returns the charge taken out in
-    /// this phase (Ah); 0 if the discharge does not end with such a phase.
+    /// Returns the charge taken out (Ah) at the end of a discharge while the tester holds the lowest voltage and the
+    /// current falls. Returns 0 if the discharge has no such phase.
     pub(crate) fn held_ah(&self) -> f64 {
         let Some(last) = self.current_a.iter().rposition(|&current_a| current_a > 0.0) else { return 0.0 };
         let charge_ah = charge_ah(&self.time_s[..=last], &self.current_a[..=last]);
         let half_ah = 0.5 * charge_ah[last];
-        // Current when half of the charge has been taken out.
+        // Current after half of the charge has been taken out.
         let load_a = self.current_a[charge_ah.partition_point(|&ah| ah < half_ah).min(last)];
         let lowest_v = self.voltage_v[..=last].iter().copied().fold(f64::INFINITY, f64::min);
         let is_held = |row: usize| {
@@ -93,7 +90,7 @@ impl MeasuredPart {
     }
 }
 
-/// For every row, returns the charge taken out since the first row (Ah) by the trapezoidal rule. A gap counts like any
+/// Returns the charge taken out since the first row (Ah) for every row, by the trapezoidal rule. A gap counts like any
 /// other step.
 pub fn charge_ah(time_s: &[f64], current_a: &[f64]) -> Vec<f64> {
     let mut sum = 0.0;
@@ -124,7 +121,7 @@ mod tests {
         let mut held = load.to_vec();
         held.extend([(1900.0, 1.8, 2.502), (2260.0, 0.2, 2.498), (2300.0, 0.0, 2.6)]);
         assert!((discharge(&held).held_ah() - 0.1).abs() < 1e-12, "360 s at 1 A");
-        // Under a varying load, the voltage changes, so the voltage does not count as held.
+        // A varying load changes the voltage, so it does not count as held.
         assert_eq!(
             discharge(&[(0.0, 3.0, 3.4), (600.0, 3.0, 3.2), (1200.0, 1.0, 3.3), (1800.0, 2.0, 3.1)]).held_ah(),
             0.0

@@ -1,7 +1,7 @@
 //! Makes one pass over the data: computes the residuals, their exact Jacobian, and the normal equations.
 //!
-//! The residual of a row is e = V - (OCV(s,T) - sum U_i - R0(s,T) I). From one row to the next, the equation of the
-//! voltage U of a branch is solved exactly:
+//! The residual of a row is e = V - (OCV(s,T) - sum U_i - R0(s,T) I). Between rows, the voltage U of a branch has an
+//! exact solution:
 //!
 //! `U' = R I + x (U - R I)` with `x = exp(-dt / tau)`.
 //!
@@ -9,46 +9,43 @@
 //!
 //! `dU' = x dU + (1 - x) I dR + (U - R I) x dt / tau^2 dtau`.
 //!
-//! Derivatives decay with the branch and are dropped below [`FADED_V`]. A row therefore touches only a few nodes, and
-//! the work per row does not grow with the tables.
+//! Derivatives decay with the branch voltage and are dropped below [`FADED_V`]. A row therefore affects only a few
+//! nodes, and the work per row does not grow with the tables.
 //!
 //! Beyond [`HUBER_V`], the cost grows linearly (Huber), so that errors that no circuit can explain do not distort the
-//! tables. If the SOC is unknown ([`FreeScale`]), each residual is compared with the error that a circuit usually has
-//! at the row's voltage drop and temperature ([`circuit_error_v`]). Otherwise, the error of the circuit in the cold
-//! would be mistaken for lost capacity.
+//! tables. If the SOC is unknown ([`FreeScale`]), each residual is divided by the circuit model's usual error at this
+//! voltage drop and temperature ([`circuit_error_v`]). Without this division, the error in the cold would be mistaken
+//! for lost capacity.
 
 use super::grid::{Corners, Grid, arrhenius};
 use super::parameters::{Layout, ParameterTables};
 use super::record::{FitRow, Record};
 
-/// Derivatives below this value are dropped (V) per unit of a log parameter. The limit is a thousandth of the voltage
-/// resolution.
+/// Smaller derivatives are dropped (V per unit of a log parameter): a thousandth of the voltage resolution.
 const FADED_V: f64 = 1e-6;
 /// Residual above which the cost grows linearly (V).
 pub const HUBER_V: f64 = 0.05;
-/// Standard deviation of an independent residual (V): the error of a good circuit model. A residual of this size adds
-/// 0.5 to the cost.
+/// Standard deviation of an independent residual (V): the error of a good circuit model.
 const SIGMA_V: f64 = 0.010;
-/// Correlation time of the model error (s). All residuals within one correlation time together count as one independent
-/// residual.
+/// Correlation time of the model error (s). All residuals within this time count as one independent residual.
 const REPEATS_S: f64 = 50.0;
-/// Correlation time if the SOC is unknown (s). Values from 50 to 500 s change the mean SOC errors of Panasonic 18650PF
-/// cells and of a simulated LG M50 by less than 0.1 points. The same holds for a wide range of the next two constants.
-/// The EVE cell with its flat curve needs at least this value.
+/// Correlation time if the SOC is unknown (s). A cell with a flat curve (EVE) needs at least this value. For Panasonic
+/// 18650PF cells and a simulated LG M50, values from 50 to 500 s change the mean SOC errors by less than 0.1 points.
+/// Changes of [`DROP_ERROR`] and [`COLD_POWER`] have equally small effects.
 const FREE_REPEATS_S: f64 = 250.0;
-/// Error of a circuit, as a share of the voltage drop.
+/// Error of a circuit model, as a share of the voltage drop.
 const DROP_ERROR: f64 = 0.05;
-/// Power of the Arrhenius factor with which a circuit's error grows in the cold.
+/// Power of the Arrhenius factor with which a circuit model's error grows in the cold.
 pub const COLD_POWER: f64 = 0.7;
-/// Beyond this multiple of the circuit's error, the cost grows linearly.
+/// The cost grows linearly beyond this multiple of the circuit model's error.
 const HUBER_ERRORS: f64 = 3.0;
 
 /// Normal equations of the node parameters.
 #[derive(Debug, Clone)]
 pub struct NormalEquations {
     n: usize,
-    /// Matrix, row-major. The product of two parameters is stored in only one of the two symmetric places;
-    /// [`NormalEquations::symmetric`] adds both places.
+    /// Matrix, row-major. The product of two parameters is stored in only one of its two symmetric places;
+    /// [`NormalEquations::symmetric`] fills the other.
     h: Vec<f64>,
     /// Gradient of the cost.
     pub g: Vec<f64>,
@@ -57,7 +54,7 @@ pub struct NormalEquations {
 }
 
 impl NormalEquations {
-    /// Empty equations for `n` parameters.
+    /// Creates empty equations for `n` parameters.
     pub fn new(n: usize) -> Self {
         Self { n, h: vec![0.0; n * n], g: vec![0.0; n], cost: 0.0 }
     }
@@ -96,7 +93,6 @@ impl NormalEquations {
     }
 }
 
-/// Voltage and derivatives of a branch while it runs through a record.
 struct BranchRun {
     voltage_v: f64,
     by_r: Vec<f64>,
@@ -118,8 +114,8 @@ impl BranchRun {
         }
     }
 
-    /// Advances the voltage by the step of a row, but not the stored derivatives. Returns the decay x, and the
-    /// derivative dU'/dtau that this step adds.
+    /// Advances the voltage by the step of a row, but not the stored derivatives. Returns the decay x and the
+    /// derivative dU'/dtau of this step.
     fn step_voltage(&mut self, row: &FitRow, r_ohm: &[f64], tau_s: &[f64]) -> (f64, f64) {
         let (r, tau) = (row.resistance.at(r_ohm), row.tau.at(tau_s));
         let settled = r * row.mean_current_a;
@@ -164,7 +160,7 @@ impl BranchRun {
     }
 }
 
-/// Returns the residuals of a record (V): one per row, including rows that are not judged.
+/// Returns the residuals of a record (V): one per row, including rows that do not count in the fit.
 pub fn residuals(record: &Record, tables: &ParameterTables) -> Vec<f64> {
     let mut branches: Vec<_> = tables.r_ohm.iter().map(|_| BranchRun::new(0)).collect();
     let of_row = |row: &FitRow| {
@@ -182,8 +178,8 @@ pub fn residuals(record: &Record, tables: &ParameterTables) -> Vec<f64> {
     record.rows.iter().map(of_row).collect()
 }
 
-/// Unknowns of a record whose SOC is not measured: SOC = beginning - (charge - offset x time) / capacity. The
-/// parameters are the SOC at the beginning, the capacity, and the offset of the current sensor.
+/// Unknowns of a record without measured SOC: the SOC at the beginning, the capacity, and the offset of the current
+/// sensor. SOC = beginning - (charge - offset x time) / capacity.
 #[derive(Debug, Clone, Copy)]
 pub struct FreeScale<'a> {
     /// Breakpoints.
@@ -219,8 +215,8 @@ impl FreeScale<'_> {
     }
 }
 
-/// Adds the residuals and derivatives of a record to `normal`. The weights of its rows are multiplied by `scale`. If
-/// `free` is given, the derivatives with respect to the unknowns of the SOC are added too.
+/// Adds the residuals and derivatives of a record to `normal`. `scale` multiplies the weights of its rows. If `free` is
+/// given, derivatives with respect to its unknowns are added.
 pub fn accumulate(
     record: &Record,
     scale: f64,
@@ -261,7 +257,6 @@ pub fn accumulate(
     }
 }
 
-/// Collects the derivatives of the residual with respect to every parameter that affects the row.
 fn derivatives(
     row: &FitRow,
     layout: &Layout,
@@ -290,14 +285,13 @@ fn derivatives(
     }
 }
 
-/// Returns the expected voltage error of a circuit at a voltage drop and a temperature (V).
+/// Returns the error of a circuit model (V) that is expected at a voltage drop and a temperature.
 fn circuit_error_v(drop_v: f64, temperature_c: f64) -> f64 {
     SIGMA_V.hypot(DROP_ERROR * drop_v) * libm::pow(arrhenius(temperature_c).max(1.0), COLD_POWER)
 }
 
-/// Returns the cost per second of a residual if the expected error is `error_v`, and the weight of the residual's
-/// square in the normal equations. The cost includes the logarithm of the error, because the error grows with the
-/// voltage drop, which depends on the parameters.
+/// Returns the cost per second of a residual with the expected error `error_v`, and the weight of its square in the
+/// normal equations. The error depends on the parameters through the voltage drop, so the cost includes its logarithm.
 fn free_cost(residual: f64, error_v: f64) -> (f64, f64) {
     let errors = residual.abs() / error_v;
     let (cost, robust) = if errors <= HUBER_ERRORS {
@@ -308,13 +302,13 @@ fn free_cost(residual: f64, error_v: f64) -> (f64, f64) {
     ((cost + libm::log(error_v / SIGMA_V)) / FREE_REPEATS_S, robust / (error_v * error_v * FREE_REPEATS_S))
 }
 
-/// Returns the cost of a residual, and the weight of the residual's square in the normal equations.
+/// Returns the cost of a residual, and the weight of its square in the normal equations.
 fn huber(residual: f64) -> (f64, f64) {
     let size = residual.abs();
     if size <= HUBER_V { (0.5 * residual * residual, 1.0) } else { (HUBER_V * (size - 0.5 * HUBER_V), HUBER_V / size) }
 }
 
-/// Returns the seconds of judged rows near each node.
+/// Returns the seconds of data near each node.
 pub fn visits(records: &[&Record], nodes: usize) -> Vec<f64> {
     let mut seconds = vec![0.0; nodes];
     let mut visit = |corners: &Corners, weight_s: f64| {

@@ -1,7 +1,7 @@
 //! Defines the prior of a fit: smooth tables, Arrhenius' law between temperatures, and an OCV near the slow test.
 //!
 //! Each term is a linear combination of node parameters with a target and a standard deviation. The curvature at a node
-//! is the change of the slope, multiplied by the mean of the distances to both neighbours.
+//! is the change of the slope times the mean distance to both neighbours.
 
 use super::grid::{Grid, arrhenius};
 use super::parameters::Layout;
@@ -10,10 +10,10 @@ use super::pass::NormalEquations;
 /// Standard deviations of the prior's terms.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PriorDeviations {
-    /// Second difference over SOC, scaled to the node spacing (V). With a slow test, this is the difference of the
-    /// correction; without a slow test, of the OCV.
+    /// Second difference over SOC, scaled to the node spacing (V): of the OCV or, with a slow test, of the correction
+    /// to the slow test.
     pub ocv_curvature_v: f64,
-    /// Difference of the correction (with a slow test) or of the OCV (without) between neighbouring temperatures (V).
+    /// Difference between neighbouring temperatures (V): of the OCV or, with a slow test, of the correction.
     pub ocv_by_temperature_v: f64,
     /// Deviation of the OCV from the slow test (V) per node; unused without a slow test.
     pub ocv_pull_v: f64,
@@ -61,8 +61,8 @@ impl PriorDeviations {
         ..Self::FREE_OCV
     };
 
-    /// Prior around the usual resistances of a chemistry (`cell::chemistry`), with the spread of five fitted cells. A
-    /// cell's deviation is mostly common to all nodes of a table.
+    /// Prior around the usual resistances of a chemistry (`cell::chemistry`), with the spread of five fitted cells.
+    /// Most of a cell's deviation is common to all nodes of a table.
     pub const CHEMISTRY: Self = Self {
         ocv_by_temperature_v: 0.006,
         r0_curvature: 0.15,
@@ -76,8 +76,8 @@ impl PriorDeviations {
     };
 
     /// Prior for an ageing cell. Each discharge and charge has one current, so only the first rows separate R0 from the
-    /// branch. R0 therefore hardly bends, and the time constant stays fixed. At the empty end, OCV and branch are both
-    /// steep and cannot be separated either. The branch bends no more than drives allow
+    /// branch. R0 therefore hardly varies over SOC, and the time constant stays fixed. Near empty, OCV and branch
+    /// resistance are both steep and cannot be separated. The branch varies only as much as drives allow
     /// ([`PriorDeviations::SLOW_TEST`]), so that the knee belongs to the OCV.
     pub const AGEING: Self = Self {
         ocv_curvature_v: 0.5,
@@ -102,7 +102,7 @@ struct PriorDensity {
 pub struct Prior(Vec<PriorDensity>);
 
 impl Prior {
-    /// Creates the prior around the starting values `start`. If `slow_test` is set, the OCV in `start` was measured.
+    /// Creates the prior around the starting values `start`. If `slow_test` is set, the OCV in `start` is measured.
     pub fn new(grid: &Grid, layout: &Layout, start: &[f64], slow_test: bool, deviations: &PriorDeviations) -> Self {
         let mut prior = Self(Vec::new());
         let reference = if slow_test { &start[..layout.nodes] } else { &vec![0.0; layout.nodes] };
@@ -129,8 +129,8 @@ impl Prior {
         prior
     }
 
-    /// Creates the prior around known resistances and time constants in `start`. The prior constrains their shape and
-    /// size. For the OCV, the prior constrains only the differences between temperatures.
+    /// Creates the prior around known resistances and time constants in `start`. It constrains their shape and size.
+    /// For the OCV, it constrains only the differences between temperatures.
     pub fn about(grid: &Grid, layout: &Layout, start: &[f64], deviations: &PriorDeviations) -> Self {
         let mut prior = Self(Vec::new());
         let of = |first: usize| &start[first..first + layout.nodes];
@@ -172,7 +172,6 @@ impl Prior {
         self.0.push(PriorDensity { terms, target, sigma });
     }
 
-    /// Keeps the second derivative over SOC as in `reference`.
     fn curvature(&mut self, grid: &Grid, first: usize, reference: &[f64], sigma: f64) {
         let columns = grid.soc.len();
         for row in 0..grid.temperature_c.len() {
@@ -186,7 +185,6 @@ impl Prior {
         }
     }
 
-    /// Keeps the difference between neighbouring temperatures as in `reference`.
     fn by_temperature(&mut self, grid: &Grid, first: usize, reference: &[f64], sigma: f64) {
         let columns = grid.soc.len();
         for row in 1..grid.temperature_c.len() {
@@ -197,7 +195,6 @@ impl Prior {
         }
     }
 
-    /// Keeps the values near `reference`.
     fn level(&mut self, first: usize, reference: &[f64], sigma: f64) {
         for at in first..first + reference.len() {
             self.push(vec![(at, 1.0)], first, reference, sigma);

@@ -1,32 +1,32 @@
 //! Prepares measured rows for the fit: joins them into blocks, positions them in the tables, and weights them by time.
 //!
-//! A block collects raw rows until it is [`BLOCK_S`] long. Voltage, current, temperature and SOC of the block are the
-//! values of its last row, because the series resistance acts immediately. The branches use the mean current of the
-//! block, so no charge is lost. A block ends early at a gap. It also ends before a current step that follows a steady
-//! current, so that both sides of the edge of a pulse are kept. A gap hides charge if the currents at both ends of the
-//! gap do not explain the change of the SOC. After such a gap, the branches start relaxed (at 0 V).
+//! A block collects raw rows until it is [`BLOCK_S`] long. Its voltage, current, temperature and SOC are those of its
+//! last row, because the series resistance acts immediately. The RC branches use its mean current, so that no charge is
+//! lost. A block ends early at a gap. It also ends before a current step that follows a steady current, so that both
+//! sides of the step are kept. A gap hides charge if the currents at its ends do not explain the change of the SOC.
+//! After such a gap, the branches start relaxed (at 0 V).
 
 use super::MeasuredPart;
 use super::grid::{Corners, Grid};
 use crate::filter::ends;
 
-/// Maximum length of a block (s). The time constants of the branches are several times longer, and the current of
-/// drives changes about once a second.
+/// Maximum length of a block (s). Time constants of the branches are several times longer, and the current of drives
+/// changes about once a second.
 const BLOCK_S: f64 = 1.0;
 /// Current step that ends a block early after a steady current, as a share of the largest current.
 const EDGE_SHARE: f64 = 0.1;
-/// Time with steady current before an edge (s); drives are rarely steady that long.
+/// Time with steady current before an edge (s). Drives are rarely steady that long.
 const STEADY_S: f64 = 3.0;
-/// Maximum number of seconds that one row represents. Without this limit, rests logged once a minute would outweigh
-/// drives.
+/// Maximum number of seconds that one row represents. Otherwise, rests logged once a minute would outweigh drives.
 const MAX_WEIGHT_S: f64 = 20.0;
 /// Shortest gap that may hide charge (s).
 const GAP_S: f64 = 60.0;
-/// If a gap hides more charge than this, as SOC, the state of the branches is unknown.
+/// If a gap hides more charge than this (as SOC), the state of the branches is unknown.
 const HIDDEN_SOC: f64 = 0.002;
-/// If current flows after such a gap, rows are not judged for this time (s), because the branches are still wrong.
+/// Time (s) for which rows do not count in the fit after a gap that hides charge and ends under load, because the
+/// branches are still wrong.
 const UNKNOWN_S: f64 = 600.0;
-/// Current below which a cell rests, as a share of the largest current.
+/// A cell rests below this current, as a share of the largest current.
 const REST_SHARE: f64 = 0.02;
 
 /// One row of the fit.
@@ -48,7 +48,7 @@ pub struct FitRow {
     pub temperature_c: f64,
     /// State of charge.
     pub soc: f64,
-    /// Seconds that the row represents; 0 = it advances the branches but is not judged.
+    /// Seconds that the row represents; 0 = it only advances the branches and does not count in the fit.
     pub weight_s: f64,
     /// Nodes of the OCV.
     pub ocv: Corners,
@@ -65,7 +65,7 @@ pub struct Record {
     pub rows: Vec<FitRow>,
     /// Number of raw rows.
     pub raw_rows: usize,
-    /// Number of rows that are not judged because their voltage is not plausible for this cell (disconnected sensor).
+    /// Number of rows that do not count because their voltage is not plausible for this cell (disconnected sensor).
     pub outliers: usize,
 }
 
@@ -81,8 +81,8 @@ pub struct Limits {
 }
 
 impl Record {
-    /// Prepares a part. If `judged[k]` is false, the voltage of raw row k is not judged. If `judged` is empty, this
-    /// rule excludes no rows.
+    /// Prepares a part. If `judged[k]` is false, raw row k does not count in the fit; an empty `judged` excludes no
+    /// row.
     pub fn prepare(raw: &MeasuredPart, judged: &[bool], grid: &Grid, limits: &Limits) -> Self {
         let largest_a = raw.current_a.iter().fold(0.0_f64, |most, i| most.max(i.abs()));
         let ends = block_ends(raw, largest_a);
@@ -109,7 +109,7 @@ impl Record {
         record
     }
 
-    /// Returns the smallest and largest SOC of the judged rows.
+    /// Returns the smallest and largest SOC of the rows that count in the fit.
     pub fn judged_ends(&self) -> (f64, f64) {
         ends(self.rows.iter().filter(|row| row.weight_s > 0.0).map(|row| row.soc))
     }
@@ -120,16 +120,15 @@ impl Record {
     }
 }
 
-/// Weight of a whole discharge (s): the length of a drive. A longer test contains no more information.
+/// Weight of a whole discharge (s), about the length of a drive. Longer tests contain no more information.
 const WHOLE_S: f64 = 8000.0;
-/// Weight of slow tests and pulse tests relative to drives: the model should follow drives.
+/// Weight of slow tests and pulse tests relative to drives. It is below 1 because the model should follow drives.
 const TEST_SHARE: f64 = 0.3;
-/// In a drive, current flows for more than the first share of the time, and the standard deviation of the current is
-/// more than the second share of its mean.
+/// Limits of a drive: smallest share of the time in which current flows, and smallest ratio of the current's standard
+/// deviation to its mean.
 const DRIVE: (f64, f64) = (0.5, 0.3);
 
-/// Returns 1 for a drive (varying current for a large part of the time), and [`TEST_SHARE`] for pulse tests with rests
-/// and for constant current.
+/// Returns 1 for a drive. Returns [`TEST_SHARE`] for pulse tests with rests and for constant current.
 pub fn share(record: &Record) -> f64 {
     let largest = record.rows.iter().fold(0.0_f64, |most, row| most.max(row.current_a.abs()));
     let (mut all, mut flowing, mut first, mut second) = (0.0, 0.0, 0.0, 0.0);
@@ -146,15 +145,13 @@ pub fn share(record: &Record) -> f64 {
     if flowing > DRIVE.0 * all && variation > DRIVE.1 { 1.0 } else { TEST_SHARE }
 }
 
-/// Returns the weight of each second of the record. The weight of the whole record depends on the SOC range that it
-/// covers, not on its length.
+/// Returns the weight of each second. The weight of the whole record depends on its SOC range, not on its length.
 pub fn weight(record: &Record) -> f64 {
     let (low, high) = record.judged_ends();
     let seconds: f64 = record.rows.iter().filter(|row| row.weight_s > 0.0).map(|row| row.weight_s).sum();
     if seconds > 0.0 { (high - low) * WHOLE_S / seconds } else { 0.0 }
 }
 
-/// Returns the indices of the raw rows that end a block. The first row is a block by itself.
 fn block_ends(raw: &MeasuredPart, largest_a: f64) -> Vec<usize> {
     let (time_s, current_a) = (&raw.time_s, &raw.current_a);
     let (mut ends, mut last, mut last_step_s) = (vec![0], 0, f64::NEG_INFINITY);
@@ -199,7 +196,7 @@ fn block_row(raw: &MeasuredPart, before: usize, end: usize, grid: &Grid) -> FitR
 }
 
 /// Whether the SOC change during a gap differs by more than [`HIDDEN_SOC`] from the charge that the currents at both
-/// ends of the gap would move.
+/// ends would move.
 fn hides_charge(raw: &MeasuredPart, before: usize, end: usize, capacity_ah: f64) -> bool {
     (before + 1..=end).any(|k| {
         let dt_s = raw.time_s[k] - raw.time_s[k - 1];

@@ -1,43 +1,39 @@
 //! Minimises the cost within bounds: projected Levenberg-Marquardt on normal equations.
 //!
-//! Some parameters form a *rising* block (the OCV over SOC). For such a block, the solver uses its first value and the
-//! rises from node to node instead of the node values. A bound on each rise keeps the curve monotone. The damped
-//! quadratic model is minimised within the bounds by block pivoting. Each iteration changes the set of parameters that
-//! are held at a bound, and solves for the free parameters by a Cholesky factorisation. A step is taken if it lowers
-//! the true cost.
+//! Some parameters form a *rising* block (the OCV over SOC). There, the solver uses the first value and the rises from
+//! node to node instead of the node values. A bound on each rise keeps the curve monotone. The damped quadratic model
+//! is minimised within the bounds by block pivoting: each iteration changes the set of parameters that are held at a
+//! bound, and solves for the others by a Cholesky factorisation. A step is taken if it lowers the true cost.
 
 use nalgebra::{DMatrix, DVector};
 
 use super::pass::NormalEquations;
 use crate::filter::levenberg_marquardt::{self, Damping};
 
-/// Maximum number of passes over the data.
 const MAX_PASSES: usize = 60;
-/// The fit has converged if the cost falls by less than this fraction twice in a row, in steps with weak damping
+/// The fit has converged if the cost falls by less than this fraction in two consecutive steps with weak damping
 /// ([`DAMPING_WEAK`]).
 const CONVERGED: f64 = 3e-4;
-/// Damping of the steps. After a step that needed more damping before it succeeded, the damping falls less, because
-/// much weaker damping would probably fail again.
+/// Damping of the steps. If a step succeeded only with more damping, the damping then falls less, because much weaker
+/// damping would probably fail again.
 const DAMPING: Damping = Damping { first: 0.3, fall: 0.1, fall_after_growth: 0.6, growth: 8.0, least: 1e-4, most: 1e8 };
 /// Up to this damping, a step is nearly undamped.
 const DAMPING_WEAK: f64 = 0.02;
-/// Maximum number of times that one step changes the set of parameters held at a bound. The result is clamped to the
-/// bounds.
+/// Maximum number of times that one step changes the set of parameters held at a bound. The result is then clamped.
 const MAX_EXCHANGES: usize = 30;
 
 /// Bounds and structure of the parameters.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Space {
-    /// Lowest values. In a rising block: lowest first value, then lowest rises.
+    /// Lowest values. For a rising block: lowest first value, then lowest rises.
     pub low: Vec<f64>,
-    /// Highest values.
+    /// Highest values, in the same form.
     pub high: Vec<f64>,
     /// Rising blocks: first index and length.
     pub rising: Vec<(usize, usize)>,
 }
 
 impl Space {
-    /// Converts node values to first values and rises.
     fn to_steps(&self, theta: &[f64]) -> Vec<f64> {
         let mut y = theta.to_vec();
         for &(first, len) in &self.rising {
@@ -48,7 +44,6 @@ impl Space {
         y
     }
 
-    /// Converts first values and rises to node values.
     fn to_nodes(&self, y: &[f64]) -> Vec<f64> {
         let mut theta = y.to_vec();
         for &(first, len) in &self.rising {
@@ -139,7 +134,6 @@ pub fn minimise(
     Solution { theta, cost: normal.cost, passes: found.steps + 1, converged: found.has_converged }
 }
 
-/// State of a parameter in the bounded step.
 #[derive(Clone, Copy, PartialEq)]
 enum BoundState {
     Free,
@@ -175,7 +169,6 @@ fn bounded_step(h: &DMatrix<f64>, g: &DVector<f64>, damping: f64, y: &[f64], spa
     Some(d)
 }
 
-/// Solves for the free parameters, with the held parameters at their bounds.
 fn solve_free(
     damped: &DMatrix<f64>,
     g: &DVector<f64>,
@@ -235,7 +228,7 @@ fn exchange(
 mod tests {
     use super::*;
 
-    /// Fits a curve to four points. The parameters are its first value and its rises; each rise is at least 0.5.
+    /// Fits a curve to four points, with its first value and its rises as parameters. Each rise is at least 0.5.
     #[test]
     fn rising_block_reaches_the_bounded_optimum() {
         let points = [0.0, 2.0, 1.9, 4.0];
@@ -250,7 +243,7 @@ mod tests {
         };
         let space = Space { low: vec![-10.0, 0.5, 0.5, 0.5], high: vec![10.0, 9.0, 9.0, 9.0], rising: vec![(0, 4)] };
         let solution = minimise(&space, &[0.0, 1.0, 2.0, 3.0], evaluate, |_, _| {});
-        // Points 2 and 1.9 move apart to a rise of 0.5 around their mean of 1.95.
+        // The falling points 2 and 1.9 become 1.7 and 2.2: a rise of 0.5 around their mean of 1.95.
         for (found, expected) in solution.theta.iter().zip([0.0, 1.7, 2.2, 4.0]) {
             assert!((found - expected).abs() < 1e-6, "{:?}", solution.theta);
         }

@@ -1,21 +1,22 @@
 //! Fits heat capacity C and thermal resistance R of a cell: C dT/dt = I (OCV - V) - (T - Ta)/R, integrated and solved
 //! by linear least squares.
 //!
-//! The surroundings are assumed to have the temperature at which a record starts. Some records start while the cell is
-//! still warm or cold. Therefore each discharge is fitted alone, and the medians of the credible results are used.
-//! Reversible heat is left out, so the values are effective values for the duty cycle of the data.
+//! The surroundings are assumed to have the temperature at which a record starts. Some cells start warmer or colder, so
+//! each discharge is fitted alone, and the medians of the credible results are used. Reversible heat is left out, so
+//! the values are effective for the duty cycle of the data.
 
 use super::parameters::ParameterTables;
 use super::record::Record;
 use crate::cell::Thermal;
 use crate::filter::{ends, median};
 
-/// Ranges of credible values: heat capacity (J/K) and thermal resistance, K/W.
+/// Ranges of credible values: heat capacity (J/K) and thermal resistance (K/W).
 const CREDIBLE: [(f64, f64); 2] = [(5.0, 1e5), (0.05, 200.0)];
 
-/// Credible heat capacity divided by stored energy (J/K) per Wh: from 300 Wh/kg with 0.8 kJ/(kg K) to 80 Wh/kg with 1
-/// kJ/(kg K). A sensor between cell and moving air sees only a share of the warming. The fitted capacity is then too
-/// large and the resistance too small by this share. The residuals do not show this error, but this range detects it.
+/// Credible heat capacity divided by stored energy (J/K per Wh): from 300 Wh/kg with 0.8 kJ/(kg K) to 80 Wh/kg with 1
+/// kJ/(kg K). A sensor between cell and moving air measures only a share of the warming. The fitted capacity is then
+/// too large, and the resistance too small. Such a fit has small residuals, but its heat capacity is outside this
+/// range.
 const CELL_J_PER_K_WH: (f64, f64) = (2.5, 12.5);
 
 /// Fits heat capacity and thermal resistance. `energy_wh` is the energy that the cell stores.
@@ -45,12 +46,13 @@ fn medians(records: &[Record], tables: &ParameterTables) -> Option<Thermal> {
     })
 }
 
-/// Solves the normal equations of T - T0 = heat / C + (-above) / (R C) for two unknowns.
+/// Solves the normal equations of T - T0 = heat / C + (-above) / (R C) for 1 / C and 1 / (R C). `heat` is the heat
+/// produced (J), and `above` is the integral of T - T0 (K s).
 fn of_record(record: &Record, tables: &ParameterTables) -> Option<Thermal> {
     let (mut hh, mut ha, mut aa, mut ht, mut at) = (0.0, 0.0, 0.0, 0.0, 0.0);
     let start_c = record.rows[0].temperature_c;
     let (mut heat, mut above) = (0.0, 0.0);
-    // Stop at a gap that hides charge, because the heat that this charge produced is unknown.
+    // Stop at a gap that hides charge, because the heat of this charge is unknown.
     for row in record.rows.iter().skip(1).take_while(|row| !row.relaxed) {
         let rise = row.temperature_c - start_c;
         heat += row.mean_current_a * (row.ocv.at(&tables.ocv_v) - row.voltage_v) * row.dt_s;

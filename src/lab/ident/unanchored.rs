@@ -3,11 +3,11 @@
 //! Input: records with the charge taken out since their first row, priors of the open-circuit curve (V, V^2) and of the
 //! resistances, and the capacity on the label (Ah). Output: tables, capacity, and the SOC at which each record starts.
 //!
-//! `SOC = s_k - (q - o t) / C`. Here q is the charge taken out and t the time since the first row. The SOC s_k at the
-//! start of record k, ln C, and the offset o of the current sensor (A) are parameters in addition to the tables. All
-//! parameters are estimated together (maximum a posteriori, Gauss-Newton in [`super::solve`]). If the records contain
-//! no information on a value, it stays at the prior. The positions of the rows in the tables depend on the SOC, so
-//! every pass computes them again.
+//! `SOC = s_k - (q - o t) / C`. Here q is the charge taken out and t the time since the first row. The parameters are
+//! the tables, the SOC s_k at the start of record k, ln C, and the offset o of the current sensor (A). All parameters
+//! are estimated together (maximum a posteriori, Gauss-Newton in [`super::solve`]). Values on which the records contain
+//! no information stay at the prior. The positions of the rows in the tables depend on the SOC, so every pass computes
+//! them again.
 
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
@@ -51,13 +51,13 @@ pub struct Known {
 /// A record whose rows have a charge instead of a SOC.
 #[derive(Debug, Clone)]
 pub struct UnanchoredRecord {
-    /// Rows. The `soc` of a row is minus the charge taken out since the first row (Ah).
+    /// Rows. `soc` is minus the charge taken out since the first row (Ah).
     pub record: Record,
     /// Weight of each second.
     pub scale: f64,
     /// Estimated SOC at the first row, with its standard deviation.
     pub beginning: (f64, f64),
-    /// Charge taken out (Ah) and time since the first row (h) at the end of a full charge (SOC 1); `None` = the record
+    /// Charge taken out (Ah) and time (h) from the first row to the end of a full charge (SOC 1); `None` = the record
     /// has no full charge.
     pub full: Option<(f64, f64)>,
 }
@@ -73,13 +73,13 @@ pub struct UnanchoredFit {
     pub capacity_std_ah: f64,
     /// Offset of the current sensor (A): measured minus true current.
     pub offset_a: f64,
-    /// Remaining standard deviation of the open-circuit voltage (V), in node order.
+    /// Standard deviation of the fitted open-circuit voltage (V), in node order.
     pub ocv_std_v: Vec<f64>,
     /// The records with the fitted SOC.
     pub records: Vec<Record>,
 }
 
-/// Prior of the curve, scaled to unit variance. Each row of `whitening` gives one residual: row . (ocv - mean).
+/// Prior of the curve, scaled to unit variance. The residuals are `whitening` x (OCV - mean).
 struct CurvePriorRows {
     first: usize,
     whitening: DMatrix<f64>,
@@ -108,8 +108,7 @@ impl CurvePriorRows {
     }
 }
 
-/// A fit whose unknowns form one vector: the tables, ln(capacity), the current offset, and the SOC at the start of each
-/// record.
+/// The unknowns form one vector: the tables, ln(capacity), the current offset, and the SOC at the start of each record.
 struct Problem<'a> {
     settings: &'a FitSettings,
     known: &'a Known,
@@ -120,7 +119,6 @@ struct Problem<'a> {
 }
 
 impl<'a> Problem<'a> {
-    /// Returns the problem, the starting values, and their bounds.
     fn new(
         settings: &'a FitSettings,
         known: &'a Known,
@@ -149,28 +147,23 @@ impl<'a> Problem<'a> {
         Ok((Self { settings, known, records, layout, prior, curve }, start, space))
     }
 
-    /// Index of ln(capacity).
     fn log_capacity(&self) -> usize {
         self.layout.len()
     }
 
-    /// Index of the current sensor's offset (A).
     fn offset(&self) -> usize {
         self.layout.len() + 1
     }
 
-    /// Index of the SOC at the start of record `k`.
     fn beginning(&self, k: usize) -> usize {
         self.layout.len() + 2 + k
     }
 
-    /// Returns record `k` with the SOC of its rows.
     fn placed(&self, theta: &[f64], k: usize) -> Record {
         let of_all = [theta[self.log_capacity()], theta[self.offset()]];
         place(&self.records[k].record, self.settings, theta[self.beginning(k)], of_all)
     }
 
-    /// Returns cost and derivatives.
     fn evaluate(&self, theta: &[f64]) -> NormalEquations {
         let tables = ParameterTables::new(&self.layout, theta);
         let of_record = |k: usize| {
@@ -187,7 +180,7 @@ impl<'a> Problem<'a> {
             accumulate(&self.placed(theta, k), scale, &self.layout, &tables, Some(&free), &mut normal);
             normal
         };
-        // The sums are added in the order of the records, so the result does not depend on the threads.
+        // Adding the sums in the order of the records makes the result independent of the threads.
         let sums: Vec<NormalEquations> = (0..self.records.len()).into_par_iter().map(of_record).collect();
         let mut normal = NormalEquations::new(theta.len());
         sums.iter().for_each(|sum| normal.add_all(sum));
@@ -197,8 +190,7 @@ impl<'a> Problem<'a> {
         normal
     }
 
-    /// Converts a solution. `std` returns the standard deviation of an unknown by its index (open-circuit voltage or
-    /// ln(capacity)).
+    /// Converts a solution. `std` returns the standard deviation of the unknown with this index.
     fn outcome(&self, solution: &Solution, std: impl Fn(usize) -> f64) -> UnanchoredFit {
         let theta = &solution.theta;
         let tables = ParameterTables::new(&self.layout, theta);
@@ -222,8 +214,8 @@ impl<'a> Problem<'a> {
         }
     }
 
-    /// Adds the priors of the capacity, of the current offset, and of the SOC at the start and at the full charge of
-    /// each record.
+    /// Adds the priors of the capacity, of the current offset, and of each record's SOC at the start and at a full
+    /// charge.
     fn add_capacity_and_beginnings(&self, theta: &[f64], normal: &mut NormalEquations) {
         let (log_capacity, offset) = (self.log_capacity(), self.offset());
         let mut near = |at: usize, mean: f64, std: f64| {
@@ -273,7 +265,7 @@ pub fn fit(
     Ok(problem.outcome(&solution, std))
 }
 
-/// Returns the prior model, as if the records contained no information.
+/// Returns the result of a fit to records that contain no information: the prior model.
 ///
 /// # Errors
 /// The prior has no inverse.
@@ -288,7 +280,6 @@ pub fn prior(settings: &FitSettings, known: &Known, records: &[UnanchoredRecord]
     Ok(problem.outcome(&solution, std))
 }
 
-/// Sets the SOC of a record's rows and positions them in the tables.
 fn place(record: &Record, settings: &FitSettings, beginning_soc: f64, [log_capacity, offset_a]: [f64; 2]) -> Record {
     let grid = &settings.grid;
     let per_ah = libm::exp(-log_capacity);
@@ -299,8 +290,7 @@ fn place(record: &Record, settings: &FitSettings, beginning_soc: f64, [log_capac
         let place = grid.place(row.soc, row.temperature_c);
         (row.ocv, row.resistance, row.tau) =
             (grid.ocv_corners(&place), grid.resistance_corners(&place), grid.tau_corners(&place));
-        // A cell warms up during a drive. The resistances of the cell follow Arrhenius' law between the temperatures of
-        // the tables, and also outside them.
+        // Cells warm up during a drive, so resistances follow Arrhenius' law beyond the temperatures of the tables.
         let inside_c = row.temperature_c.clamp(coldest_c, warmest_c);
         let factor = arrhenius(row.temperature_c) / arrhenius(inside_c);
         row.resistance.weight.iter_mut().for_each(|weight| *weight *= factor);

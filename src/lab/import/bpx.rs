@@ -1,9 +1,9 @@
 //! Converts a BPX file (Battery Parameter eXchange, JSON) to a cell model.
 //!
 //! Input: the text of a BPX file of version 0.x or 1.x with the model SPM, SPMe or DFN. Output: the TOML of a cell
-//! model. The open-circuit curve is the difference of the electrodes' potentials (`curve.rs`). The resistances are
-//! derived from the physical parameters (`circuit.rs`). `[provenance]` states each derivation. If the input is wrong,
-//! every fault is reported with its path in the JSON, what was found and what is allowed.
+//! model. The open-circuit curve is the difference of the electrodes' potentials (`curve.rs`). The resistances follow
+//! from the physical parameters (`circuit.rs`). `[provenance]` states each derivation. Every fault is reported with its
+//! path in the JSON.
 //!
 //! Source: BPX standard, Faraday Institution (https://bpxstandard.com).
 
@@ -33,12 +33,12 @@ const GAS_J_PER_MOL_K: f64 = 8.314_462_618;
 /// Temperatures of the tables relative to the file's reference temperature (K).
 const TEMPERATURES_K: [f64; 6] = [-35.0, -25.0, -15.0, 0.0, 15.0, 30.0];
 
-/// Standard deviation of the voltage error at rest and at the reference temperature (V). This error covers the
-/// difference between a real cell and its parameters.
+/// Standard deviation of the voltage error at rest and at the reference temperature (V), because a real cell differs
+/// from its parameters.
 const ERROR_AT_REST_V: f64 = 0.010;
 
-/// This share of the voltage drop at 1C is also part of the error (root of the sum of squares), because the formulas
-/// hold only for small currents.
+/// Share of the voltage drop at 1C in the error (root of the sum of squares), because the formulas hold only for small
+/// currents.
 const ERROR_OF_DROP: f64 = 0.3;
 
 /// Settings of a conversion.
@@ -63,7 +63,6 @@ pub struct BpxImport {
     pub nominal_ah: f64,
 }
 
-/// Tables of the model, one row per temperature.
 #[derive(Debug)]
 struct Model {
     temperature_c: Vec<f64>,
@@ -125,13 +124,11 @@ impl Model {
         Ok(Self { temperature_c, curve: table, resistances, voltage_error_v })
     }
 
-    /// Returns the number of branches of a node: 2 without electrolyte, 3 with it.
     fn branch_count(&self) -> usize {
         self.resistances.first().and_then(|row| row.first()).map_or(0, |of| of.branches.len().min(MAX_BRANCHES))
     }
 }
 
-/// Returns notes on the conversion for the user.
 fn notes(cell: &BpxCell, curve: &Curve<'_>, model: &Model) -> Vec<String> {
     let mut notes = cell.notes.clone();
     let electrodes = [&cell.negative, &cell.positive];

@@ -1,9 +1,9 @@
 //! Finds the signals of a DBC that are probably battery signals, and writes them as the `[input]` part of a
 //! configuration. Only name, unit and range are considered.
 //!
-//! Input: a parsed DBC and its name. Output: TOML with the best candidate for each input; the next candidates are
-//! comments. `packwatch discover` can check the values in a log, and the owner must confirm the result. A DBC does not
-//! show the sign of the current, so the sign is left open. The part is not a valid configuration until it is completed.
+//! The next candidates for each input are written as comments. The owner must confirm the result; `packwatch discover`
+//! can check the values in a log. A DBC does not show the sign of the current, so the owner must add the sign to the
+//! configuration.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -15,13 +15,11 @@ use crate::error::LabError;
 use crate::fit::quoted;
 use crate::wiring::evidence::{PackQuantity, SignalLabel};
 
-/// A candidate.
 #[derive(Debug, Clone)]
 struct Candidate {
     points: f64,
-    /// Name of the signal, or pattern of several names.
     name: String,
-    /// The lines that convert the signal's unit, such as `scale = 0.001`; empty if no conversion is needed.
+    /// Lines that convert the signal's unit, such as `scale = 0.001`; empty = no conversion is needed.
     conversion: Vec<String>,
 }
 
@@ -57,33 +55,32 @@ pub fn import(database: &Database, file: &str) -> Result<String, LabError> {
     Ok(text(file, &candidates))
 }
 
-/// Returns the quantities that a signal may carry, with points.
 fn judge(message: &Message, signal: &Signal) -> Vec<(PackQuantity, f64)> {
     let label = SignalLabel::new(&message.name, &signal.name, &signal.unit);
     let largest = largest(signal) * SignalUnit::parse(&signal.unit).map_or(1.0, |unit| unit.factor);
     let points = |quantity| {
         let points = label.score(quantity)?.points;
         let (fits, points) = match quantity {
-            // A range that is too large for one cell belongs to the sum of several cells.
+            // A larger range belongs to the sum of several cells.
             PackQuantity::CellVoltage if label.says_extreme() => (largest <= 10.0, points - 1.0),
             PackQuantity::CellVoltage => (largest <= 10.0, points),
             PackQuantity::PackVoltage => (largest > 60.0 && !label.says_cell(), points),
             PackQuantity::Current | PackQuantity::Temperature | PackQuantity::Soc | PackQuantity::Soh => (true, points),
         };
-        // A matching unit and a name that contains the quantity give at least three points, before deductions.
+        // Before deductions, a matching unit and a name that contains the quantity give at least three points.
         (fits && points >= 3.0 && signal.layout.length_bits >= 4).then_some((quantity, points))
     };
     PackQuantity::ALL.into_iter().filter_map(points).collect()
 }
 
-/// The keys that convert the unit of the DBC to the unit of the input. If a converted value would be smaller than any
-/// pack's, the unit in the DBC is wrong, and no key is returned.
+/// Returns the keys that convert the unit of the DBC to that of the input. If the converted range is too small for any
+/// pack, the unit in the DBC is wrong and no key is returned.
 fn conversion(quantity: PackQuantity, signal: &Signal) -> Vec<String> {
     let wanted = match quantity {
         PackQuantity::Current => Quantity::Current,
         PackQuantity::CellVoltage | PackQuantity::PackVoltage => Quantity::Voltage,
         PackQuantity::Temperature => Quantity::Temperature,
-        // A fraction is below 1.5. The unit % needs no key.
+        // A maximum above 1.5 means percent. With the unit `%`, no key is needed.
         PackQuantity::Soc | PackQuantity::Soh if signal.unit != "%" && largest(signal) > 1.5 => {
             return vec!["scale = 0.01".to_owned()];
         }
@@ -105,7 +102,7 @@ fn largest(signal: &Signal) -> f64 {
     if layout.has_range() { layout.maximum.min(top) } else { top }
 }
 
-/// If the names of at least three signals differ only in a number, joins these signals to one pattern and adds points.
+/// Joins signals to one pattern and adds points if the names of at least three signals differ only in a number.
 fn with_patterns(cells: Vec<Candidate>) -> Vec<Candidate> {
     let names: Vec<(String, &str)> = cells.iter().map(|cell| (String::new(), cell.name.as_str())).collect();
     let found = groups(&names);
@@ -113,7 +110,7 @@ fn with_patterns(cells: Vec<Candidate>) -> Vec<Candidate> {
     let mut grouped = std::collections::BTreeSet::new();
     for group in found.iter().filter(|group| group.members.len() >= 3) {
         let first = group.members[0].1;
-        // A group of many similar signals probably contains cells.
+        // A group of similar signals probably contains cells.
         let Candidate { points, conversion, .. } = cells[first].clone();
         ranked.push(Candidate { points: points + 4.0, name: group.pattern.clone(), conversion });
         grouped.extend(group.members.iter().map(|member| member.1));

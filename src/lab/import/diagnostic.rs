@@ -1,7 +1,6 @@
 //! Writes `[[input.diagnostic]]` tables as TOML: one answer with its signals, one signal per line.
 //!
-//! Numbers are written with the fewest digits that read back as the same number. Values have the unit that the signal
-//! states.
+//! Numbers are written with the fewest digits that read back as the same number. Values have the unit of their signal.
 
 use std::fmt;
 
@@ -10,11 +9,9 @@ use crate::can::CanId;
 /// One `[[input.diagnostic]]`: a request, and the signals in its answer.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct DiagnosticTable {
-    /// Part of the signals' names before the dot; several tables may share it.
+    /// Part of the signals' names before the dot. Several tables may share it.
     pub(crate) name: String,
-    /// Identifier of requests.
     pub(crate) request: CanId,
-    /// Identifier of the answers.
     pub(crate) response: CanId,
     /// First data byte of requests and of answers; `None` = addressing is not extended.
     pub(crate) extension: Option<(u8, u8)>,
@@ -28,7 +25,7 @@ pub(crate) struct DiagnosticTable {
     pub(crate) signals: Vec<DiagnosticSignal>,
 }
 
-/// One signal, or a numbered series of signals with equal properties.
+/// A signal, or a numbered series of signals with equal properties.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct DiagnosticSignal {
     /// Name, with `{n}` if `numbers` is given.
@@ -37,17 +34,13 @@ pub(crate) struct DiagnosticSignal {
     pub(crate) bit: u32,
     /// Number of bits, 1 to 64.
     pub(crate) length: u32,
-    /// Whether the value is in two's complement.
     pub(crate) signed: bool,
-    /// Whether the least significant byte is first.
     pub(crate) little_endian: bool,
-    /// Change of the value if the code increases by 1.
+    /// Change of the value per code.
     pub(crate) factor: f64,
     /// Value of code 0.
     pub(crate) offset: f64,
-    /// Unit; may be empty.
     pub(crate) unit: String,
-    /// Smallest and largest allowed value.
     pub(crate) range: Option<(f64, f64)>,
     /// Codes that mean "not available".
     pub(crate) not_available: Vec<u64>,
@@ -55,31 +48,26 @@ pub(crate) struct DiagnosticSignal {
     pub(crate) numbers: Option<NumberRange>,
 }
 
-/// Numbers of a series, both ends included.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct NumberRange {
-    /// First number.
     pub(crate) first: u32,
-    /// Last number.
     pub(crate) last: u32,
     /// Number of bits from the start of one signal to the start of the next.
     pub(crate) step: u32,
 }
 
 impl DiagnosticTable {
-    /// Returns the number of signals; each signal of a series counts.
     pub(crate) fn signal_count(&self) -> usize {
         self.signals.iter().map(|signal| signal.count() as usize).sum()
     }
 }
 
 impl DiagnosticSignal {
-    /// Returns the number of signals of the series; 1 without a series.
+    /// Returns the number of signals of the series; 1 = a single signal.
     pub(crate) fn count(&self) -> u32 {
         self.numbers.map_or(1, |numbers| numbers.last - numbers.first + 1)
     }
 
-    /// Returns the first and last bit of each signal of the series.
     pub(crate) fn spans(&self) -> impl Iterator<Item = (u32, u32)> {
         let step = self.numbers.map_or(0, |numbers| numbers.step);
         (0..self.count()).map(move |n| (self.bit + n * step, self.bit + n * step + self.length - 1))
@@ -97,7 +85,7 @@ impl DiagnosticSignal {
         Self { signed: true, range: None, ..self.clone() }
     }
 
-    /// Returns the value in the data after the echoed service and identifier; `None` = the data are too short, or the
+    /// Returns the value in the data after the echoed service and identifier. `None` = the data are too short, or the
     /// value is not available or out of range.
     pub(crate) fn value(&self, data: &[u8]) -> Option<f64> {
         let (first, last) = (self.bit / 8, (self.bit + self.length - 1) / 8);
@@ -109,19 +97,17 @@ impl DiagnosticSignal {
         let unused = 64 - self.length;
         let number = if self.signed { ((code << unused).cast_signed() >> unused) as f64 } else { code as f64 };
         let value = number * self.factor + self.offset;
-        // Half a code of tolerance, because the limits are rounded decimals.
+        // The tolerance is half a code, because the limits are rounded decimals.
         let room = self.factor.abs() / 2.0;
         let is_inside = self.range.is_none_or(|(low, high)| value >= low - room && value <= high + room);
         (is_inside && !self.not_available.contains(&code)).then_some(value)
     }
 
-    /// Returns the smallest and largest code.
     pub(crate) fn codes(&self) -> (f64, f64) {
         let top = 2_f64.powi(i32::try_from(self.length).unwrap_or(64));
         if self.signed { (-top / 2.0, top / 2.0 - 1.0) } else { (0.0, top - 1.0) }
     }
 
-    /// Returns the smallest and largest value that the bits can represent.
     pub(crate) fn representable(&self) -> (f64, f64) {
         let (low, high) = self.codes();
         let (a, b) = (low * self.factor + self.offset, high * self.factor + self.offset);

@@ -1,12 +1,12 @@
 //! Converts an OBDb signal set (one JSON file per car model) to `[[input.diagnostic]]` tables.
 //!
-//! Input: the text of the JSON, a model year, and a name. Output: TOML with one table per command and one signal per
-//! line. The tables are sorted by the identifiers of requests and answers, so the commands of one controller are
-//! together. The licence of the source, CC BY-SA 4.0, also applies to the TOML; the TOML states it.
+//! The tables are sorted by the identifiers of requests and answers, so the commands of one controller are together.
+//! The licence of the source, CC BY-SA 4.0, also applies to the TOML, which states it.
 //!
 //! Signals are named `NAME.REST`. If all ids of a file start with the same word, REST is the `id` without this word,
-//! and NAME is the given name or this word. Otherwise, REST is the whole `id`, and NAME is the given name or `Car`. A
-//! file that is not an OBDb signal set is an error. A command or signal that cannot be converted becomes an
+//! and NAME is the given name or this word. Otherwise, REST is the whole `id`, and NAME is the given name or `Car`.
+//!
+//! A file that is not an OBDb signal set is an error. A command or signal that cannot be converted becomes an
 //! [`Exclusion`], and the rest is converted. An unknown field is ignored and causes a warning.
 
 mod address;
@@ -31,7 +31,7 @@ use document::{CommandDocument, SignalDocument, SignalSetDocument};
 pub struct ObdbSettings {
     /// Name of the file, for messages and the first comment.
     pub source: String,
-    /// Model year; commands of other years are left out. `None` = all commands are converted.
+    /// Model year. Commands of other years are left out. `None` = all commands are converted.
     pub year: Option<i64>,
     /// Name before the dot of every signal.
     pub name: Option<String>,
@@ -40,8 +40,7 @@ pub struct ObdbSettings {
 /// Converts the text of a signal set.
 ///
 /// # Errors
-/// The text is not an OBDb signal set, or nothing in it can be converted. The error states place, what was found and
-/// what is allowed.
+/// The text is not an OBDb signal set, or nothing in it can be converted.
 pub fn import(text: &str, settings: &ObdbSettings) -> Result<ImportResult, LabError> {
     let (document, converter) = convert(text, settings)?;
     let Converter { tables, exclusions, warnings, .. } = converter;
@@ -55,12 +54,10 @@ pub fn import(text: &str, settings: &ObdbSettings) -> Result<ImportResult, LabEr
     Ok(result)
 }
 
-/// Returns only the tables.
 pub(crate) fn tables(text: &str, settings: &ObdbSettings) -> Result<Vec<DiagnosticTable>, LabError> {
     Ok(convert(text, settings)?.1.tables)
 }
 
-/// Reads the text, and converts it to at least one table.
 fn convert(text: &str, settings: &ObdbSettings) -> Result<(SignalSetDocument, Converter), LabError> {
     let source = &settings.source;
     if let Some(name) = settings.name.as_ref().filter(|name| !is_name(name)) {
@@ -86,17 +83,15 @@ fn convert(text: &str, settings: &ObdbSettings) -> Result<(SignalSetDocument, Co
     Ok((document, converter))
 }
 
-/// Whether a text may be part of a signal's name.
 fn is_name(text: &str) -> bool {
     !text.is_empty() && text.chars().all(|c| c.is_ascii_alphanumeric() || c == '_')
 }
 
-/// The tables and exclusions of the conversion so far.
 #[derive(Debug, Default)]
 struct Converter {
     year: Option<i64>,
     tables: Vec<DiagnosticTable>,
-    /// For each signal id and each request, the place that defined it first.
+    /// Place that first defined each signal id and each request.
     known: HashMap<String, String>,
     exclusions: Vec<Exclusion>,
     warnings: Vec<String>,
@@ -205,7 +200,6 @@ impl Converter {
     }
 }
 
-/// Returns service and identifier of a command.
 fn request(command: &CommandDocument) -> Result<(u8, u16), (ExclusionReason, String)> {
     let mut entries = command.cmd.iter();
     let (Some((service, identifier)), None) = (entries.next(), entries.next()) else {
@@ -232,7 +226,6 @@ fn request(command: &CommandDocument) -> Result<(u8, u16), (ExclusionReason, Str
     Ok((service, number))
 }
 
-/// Returns remarks for a user who wants to poll the command.
 fn remarks(command: &CommandDocument) -> Vec<String> {
     let mut remarks = Vec::new();
     if let Some(seconds) = command.freq {
@@ -247,7 +240,6 @@ fn remarks(command: &CommandDocument) -> Vec<String> {
     remarks
 }
 
-/// Names the tables, shortens the names of the signals, and joins numbered signals.
 fn rename(tables: &mut [DiagnosticTable], name: Option<&str>) {
     let first_word = |signal: &DiagnosticSignal| signal.name.split_once('_').map(|(word, _)| word.to_owned());
     let words = tables.iter().flat_map(|table| &table.signals).map(first_word);
@@ -292,7 +284,7 @@ fn tail(result: &ImportResult) -> String {
     }
     let mut text = format!("\n# Left out: {}\n", result.exclusions.len());
     for exclusion in &result.exclusions {
-        // Text from the file must not end the comment.
+        // Control characters in the file must not end the comment.
         let line: String = exclusion.to_string().chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
         let _ = writeln!(text, "# {line}");
     }

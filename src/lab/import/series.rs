@@ -1,12 +1,11 @@
 //! Joins signals whose names differ only in one number to a single line with `{n}`.
 //!
-//! A series is a run of signals at rising positions of one answer. The signals differ only in one number in their
-//! names, which increases by one, and in their positions, which have a constant distance. Leading zeros of the number
-//! are dropped, because `{n}` in a pattern matches a number with any leading zeros.
+//! A series is a run of signals at rising positions of one answer. One number in their names increases by one, and the
+//! distance of their positions is constant. Leading zeros of the number are dropped, because `{n}` in a pattern matches
+//! a number with any leading zeros.
 
 use crate::import::{DiagnosticSignal, NumberRange};
 
-/// A name that is split around one of its numbers.
 #[derive(Debug, PartialEq, Eq)]
 struct NumberedName<'a> {
     before: &'a str,
@@ -14,7 +13,7 @@ struct NumberedName<'a> {
     after: &'a str,
 }
 
-/// Joins the signals of each series; `signals` are in the order of their bits.
+/// Joins the signals of each series. `signals` are in the order of their bits.
 pub(crate) fn join(signals: Vec<DiagnosticSignal>) -> Vec<DiagnosticSignal> {
     let mut joined: Vec<DiagnosticSignal> = Vec::new();
     let mut rest = signals.as_slice();
@@ -31,7 +30,6 @@ pub(crate) fn join(signals: Vec<DiagnosticSignal>) -> Vec<DiagnosticSignal> {
     joined
 }
 
-/// Returns the series that starts with the first of `signals`, and its length.
 fn series(name: &NumberedName<'_>, signals: &[DiagnosticSignal]) -> (DiagnosticSignal, usize) {
     let first = &signals[0];
     let step = signals.get(1).map_or(0, |second| second.bit.saturating_sub(first.bit));
@@ -51,7 +49,6 @@ fn series(name: &NumberedName<'_>, signals: &[DiagnosticSignal]) -> (DiagnosticS
     (joined, length)
 }
 
-/// Returns the name, split around each of its numbers in turn.
 fn numbered(name: &str) -> Vec<NumberedName<'_>> {
     let mut found = Vec::new();
     let mut at = 0;

@@ -1,9 +1,8 @@
 //! Determines the condition of a battery for a passport: every value with its time and standard deviation, or the
 //! reason why it is unknown.
 //!
-//! Input: a [`Record`], the configuration, the current cell model, and data that only people know ([`Terms`]). Measured
-//! and learned values are known; a configured start value, an untrusted estimate and an incomplete sum count as
-//! unknown.
+//! Measured and learned values are known. A configured start value, an untrusted estimate and an incomplete sum count
+//! as unknown.
 
 use super::energy::Discharge;
 use super::field::Field;
@@ -17,10 +16,10 @@ use crate::health::use_record::{LimitUse, RangeUse};
 use crate::monitor::{Downtime, ModelState, Monitor, Outputs, Snapshot};
 use crate::quantity::{CellIndex, Channel, Timestamp, catalogue};
 
-/// A time stamp before this one (2001-01-01, s since 1970) is not a date. A clock that was not set starts in 1970, 1980
-/// or 2000; a log that counts from its own start is shorter than 30 years.
+/// Earlier time stamps (before 2001-01-01, s since 1970) are not dates. A clock that was not set starts in 1970, 1980
+/// or 2000, and a log that counts from its own start is shorter than 30 years.
 const FIRST_DATE_S: f64 = 978_307_200.0;
-/// Two statements of the same value of a new battery may differ by this fraction, because they may be rounded.
+/// Tolerance (fraction) between two statements of the same value of a new battery, because they may be rounded.
 pub(super) const RATED_TOLERANCE: f64 = 0.01;
 
 /// Data from the command line that no record contains; `None` = not given.
@@ -28,7 +27,7 @@ pub(super) const RATED_TOLERANCE: f64 = 0.01;
 pub struct Terms {
     /// Charge moved before the record started (Ah); 0 = recorded since new.
     pub moved_before_ah: Option<f64>,
-    /// Total charge moved (Ah) from the battery's own counter; replaces the sum of the record.
+    /// Total charge moved (Ah) from the battery's own counter. Replaces the sum of the record.
     pub moved_ah: Option<f64>,
     /// Usable energy at the certification (kWh).
     pub certified_kwh: Option<f64>,
@@ -54,7 +53,6 @@ pub struct Condition {
     values: Vec<(Field, Known)>,
     rated: Rated,
     use_record: UseRecord,
-    /// Time of the state.
     time: Timestamp,
 }
 
@@ -62,9 +60,7 @@ pub struct Condition {
 /// battery.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Rated {
-    /// Capacity (Ah).
     pub(super) capacity_ah: Option<f64>,
-    /// Energy at the certification (kWh).
     pub(super) energy_kwh: Option<f64>,
 }
 
@@ -82,23 +78,19 @@ impl Condition {
         Ok(Self { values: values.to_vec(), rated, use_record: *battery.monitor.use_record(), time })
     }
 
-    /// Creates values for a test.
     #[cfg(test)]
     pub(super) fn of(values: Vec<(Field, Known)>, rated: Rated) -> Self {
         Self { values, rated, use_record: UseRecord::default(), time: Timestamp::default() }
     }
 
-    /// Returns the values of the new battery.
     pub(super) fn rated(&self) -> Rated {
         self.rated
     }
 
-    /// Returns how the pack was used.
     pub(super) fn use_record(&self) -> &UseRecord {
         &self.use_record
     }
 
-    /// Returns a text for each limit that was exceeded, with the time of the state.
     pub(super) fn events(&self) -> Vec<(String, Timestamp)> {
         let UseRecord { temperature_c, voltage_v, current_a, .. } = &self.use_record;
         let limits = [
@@ -125,7 +117,7 @@ fn is_date(time: Timestamp) -> bool {
     time.secs() >= FIRST_DATE_S
 }
 
-/// Returns the value; if its time is not a date, returns the reason why it is unknown.
+/// Returns the value. If its time is not a date, returns the reason why the value is unknown.
 fn dated(quantity: Quantity) -> Known {
     if is_date(quantity.time) {
         return Ok(quantity);
@@ -133,7 +125,7 @@ fn dated(quantity: Quantity) -> Known {
     Err("its time is unknown: the clock was not set when it was measured".to_owned())
 }
 
-/// Checks that a state was recorded with this configuration of the pack, as far as the state shows.
+/// Rejects a state that does not fit the configuration.
 fn check_origin(state: &Snapshot, config: &Config) -> Result<(), String> {
     let sample = &config.monitor.sample;
     if let Some(module) = config.monitor.modules.first() {
@@ -161,14 +153,13 @@ fn check_origin(state: &Snapshot, config: &Config) -> Result<(), String> {
     }
 }
 
-/// Sources of the values.
 struct Battery<'a> {
     record: &'a Record,
     config: &'a Config,
     model: &'a CellModel,
     /// Monitor restored from the state, at the time of the state.
     monitor: Monitor,
-    /// Wall clock minus the clock of the inputs, ns.
+    /// Wall clock minus the clock of the inputs (ns).
     offset_ns: i64,
     series: f64,
     strings: f64,
@@ -198,7 +189,6 @@ impl<'a> Battery<'a> {
         Ok(Self { record, config, model, monitor, offset_ns, series, strings })
     }
 
-    /// Determines a value.
     fn value(&self, field: Field, terms: &Terms, moved: &Known) -> Known {
         let rated_ah = self.rated_ah();
         match field {
@@ -237,7 +227,6 @@ impl<'a> Battery<'a> {
         time.plus_nanos(self.offset_ns)
     }
 
-    /// Returns the total charge moved (Ah).
     fn moved_ah(&self, terms: &Terms) -> Known {
         let now = self.wall(self.monitor.now());
         if let Some(value) = terms.moved_ah {
@@ -270,7 +259,7 @@ impl<'a> Battery<'a> {
         if terms.moved_before_ah != Some(0.0) {
             return Err("the record does not start with the new battery (--throughput-before-ah 0)".to_owned());
         }
-        // If only the pack's total is measured, one estimated cell represents all cells.
+        // If only the pack's total is measured, one estimated cell represents all cells in series.
         let cells = self.series / f64::from(self.config.monitor.sample.cells);
         let value = 1e-3 * self.strings * cells * energy.energy_wh;
         let std = Some(self.config.monitor.health.capacity.current_gain_std * value);
@@ -278,7 +267,6 @@ impl<'a> Battery<'a> {
         Ok(Quantity { value, std, time })
     }
 
-    /// If the estimate of a cell is untrusted, returns an error that names the cell.
     fn check_trust(&self) -> Result<(), String> {
         let mut cells = (0..self.config.monitor.sample.cells).map(CellIndex);
         match cells.find(|&cell| !self.monitor.is_trusted(cell)) {
@@ -293,7 +281,7 @@ impl<'a> Battery<'a> {
         self.check_trust()?;
         let is_voltage = |channel: Channel| matches!(channel, Channel::CellVoltage(_) | Channel::PackVoltage);
         let voltages = self.monitor.latest_readings().filter(|(channel, ..)| is_voltage(*channel));
-        // The SOC is dated with the oldest of the latest voltage readings.
+        // The SOC gets the time of the oldest among the latest voltage readings.
         let oldest = voltages.map(|(_, time, _)| time).min();
         match (self.monitor.pack(), oldest) {
             (Some(pack), Some(time)) => {
@@ -311,7 +299,6 @@ impl<'a> Battery<'a> {
         Ok(Quantity { value, std: None, time: self.wall(time) })
     }
 
-    /// Returns a time beyond a temperature limit (min).
     fn time_beyond(&self, terms: &Terms, side: fn(&RangeUse) -> LimitUse, seconds: fn(LimitUse) -> f64) -> Known {
         if terms.moved_before_ah != Some(0.0) {
             return Err("the record does not start with the new battery (--throughput-before-ah 0)".to_owned());
@@ -336,7 +323,6 @@ impl<'a> Battery<'a> {
         Ok(Quantity { value: seconds(limit) / 60.0, std: None, time: self.wall(self.monitor.now()) })
     }
 
-    /// Returns the learned values of every cell.
     fn learned(&self) -> Result<Vec<(usize, Learned)>, String> {
         self.check_trust()?;
         let of_cell = |index: usize| {
@@ -360,7 +346,6 @@ impl<'a> Battery<'a> {
         Ok(Quantity { value: *mean, std: Some(*std), time: Timestamp::from_nanos(*at_ns) }.times(self.strings))
     }
 
-    /// Returns the highest resistance ratio of all cells (relative to new).
     fn worst_resistance(&self) -> Known {
         let learned = self.learned()?;
         let worst = learned.iter().max_by(|a, b| a.1.resistance.0.total_cmp(&b.1.resistance.0));
@@ -368,8 +353,8 @@ impl<'a> Battery<'a> {
         Ok(Quantity { value: *mean, std: Some(*std), time: Timestamp::from_nanos(*at_ns) })
     }
 
-    /// Returns the mean of the cells' resistance ratios. The cells share the error of the model, so the standard
-    /// deviation of the mean is the mean of their standard deviations.
+    /// Returns the mean of the cells' resistance ratios. The standard deviation is the mean of the cells' standard
+    /// deviations, because all cells share the error of the model.
     fn mean_resistance(&self) -> Known {
         let learned = self.learned()?;
         let count = learned.len() as f64;
@@ -390,7 +375,7 @@ impl<'a> Battery<'a> {
         }
     }
 
-    /// Returns the energy of a discharge from full, at the configured load, until the weakest cell is empty (kWh).
+    /// Returns the energy of a discharge at the configured load, from full until the weakest cell is empty (kWh).
     fn energy_kwh(&self) -> Known {
         let Some(load) = &self.config.monitor.health.usable else {
             return Err("no load is configured ([usable], the load of the certification)".to_owned());
@@ -406,7 +391,8 @@ impl<'a> Battery<'a> {
         };
         let energy_wh = learned.iter().map(of_cell).sum::<f64>() / learned.len() as f64;
         let value = 1e-3 * energy_wh * self.series * self.strings;
-        // The charge dominates the uncertainty: the mean voltage is accurate to about one percent.
+        // The standard deviation contains only the uncertainty of the charge, because the mean voltage is accurate to
+        // about one percent.
         let std = (charge_ah > 0.0).then(|| value * std_ah / charge_ah);
         Ok(Quantity { value, std, time: Timestamp::from_nanos(at_ns) })
     }
@@ -417,7 +403,7 @@ impl Quantity {
         Self { value: factor * self.value, std: self.std.map(|std| factor * std), ..self }
     }
 
-    /// Converts a ratio relative to new to an increase in percent.
+    /// Converts a ratio (relative to new) to an increase in percent.
     fn increase(self) -> Self {
         Self { value: 100.0 * (self.value - 1.0), std: self.std.map(|std| 100.0 * std), ..self }
     }

@@ -1,9 +1,8 @@
-//! Writes the passport as JSON. The known values are merged into the manufacturer's part, and the result is checked
-//! against the form of its standard.
+//! Writes the passport as JSON: merges the known values into the manufacturer's part, and checks the result against the
+//! structure that the standard requires.
 //!
-//! Input: a [`Condition`] and the manufacturer's part. Output: the passport, and the [details](details) that the
-//! standards do not provide for. Each value has one source: if the manufacturer's part states a value that is also
-//! measured, the manufacturer's part is rejected. The same inputs give the same bytes.
+//! The [details](details) contain what the standards do not provide for. The manufacturer's part is rejected if it
+//! states a value that is also measured, so that each value has one source.
 
 use serde_json::{Map, Value, json};
 
@@ -19,7 +18,7 @@ use crate::io::stamp::format_utc;
 ///
 /// # Errors
 /// The manufacturer's part is faulty, or required values are missing. The error has one line per fault with its path,
-/// and one per missing value with the reason.
+/// and one line per missing value with the reason.
 pub fn passport(standard: Standard, condition: &Condition, manufacturer: Value) -> Result<Value, Vec<String>> {
     let Value::Object(mut root) = manufacturer else {
         return Err(vec!["static part: must be an object".to_owned()]);
@@ -32,7 +31,7 @@ pub fn passport(standard: Standard, condition: &Condition, manufacturer: Value) 
         if known[..index].iter().any(|(_, before, _)| before.group == place.group) {
             continue;
         }
-        // The temperatures share a group, which has the time of the oldest value.
+        // A group has the time of its oldest value. The temperatures share a group.
         let of_group = known.iter().filter(|(_, other, _)| other.group == place.group);
         let oldest = of_group.map(|(.., quantity)| quantity.time).min().unwrap_or(quantity.time);
         faults.extend(insert(&mut root, place.group, place.time, Value::from(format_utc(oldest))).err());
@@ -49,7 +48,7 @@ pub fn passport(standard: Standard, condition: &Condition, manufacturer: Value) 
     if faults.is_empty() { Ok(document) } else { Err(faults) }
 }
 
-/// Returns the manufacturer's part with `null` for each value. It has every member that no record contains.
+/// Returns an empty manufacturer's part: every member that no record contains, with `null` for each value.
 pub fn template(standard: Standard) -> Value {
     let places: Vec<String> = places(standard)
         .flat_map(|(_, place)| [joined(place.group, place.value), joined(place.group, place.time)])
@@ -58,8 +57,8 @@ pub fn template(standard: Standard) -> Value {
     shape.template("", &|path| places.iter().any(|place| place == path)).unwrap_or_default()
 }
 
-/// Removes `null` values of a template that the manufacturer did not fill in, and the objects and lists that only
-/// contained such values. An empty object or list stays, because the manufacturer wrote it.
+/// Removes `null` values, and the objects and lists that only contained such values. An empty object or list stays,
+/// because the manufacturer wrote it.
 pub fn without_nulls(value: Value) -> Option<Value> {
     match value {
         Value::Null => None,
@@ -76,7 +75,8 @@ pub fn without_nulls(value: Value) -> Option<Value> {
     }
 }
 
-/// Returns every value with its unit, definition, standard deviation and time, and the reason for each absent value.
+/// Returns every value with its unit, definition, standard deviation and time. For each absent value, returns the
+/// reason.
 pub fn details(standard: Standard, condition: &Condition, vehicle: &VehicleIdentity) -> Value {
     let (mut values, mut absent) = (Vec::new(), Vec::new());
     for field in Field::ALL {
@@ -112,7 +112,7 @@ fn places(standard: Standard) -> impl Iterator<Item = (Field, Place)> {
     Field::ALL.into_iter().filter_map(move |field| Some((field, field.place(standard)?)))
 }
 
-/// Adds the counted events to the list of negative events. The static part may also state events.
+/// Adds the counted events to the list of negative events, to which the manufacturer's part may also add.
 fn add_events(root: &mut Map<String, Value>, condition: &Condition) {
     let events = condition.events().into_iter();
     let mut events =
@@ -120,23 +120,21 @@ fn add_events(root: &mut Map<String, Value>, condition: &Condition) {
     if events.peek().is_none() {
         return;
     }
-    // If the static part has something other than a list, the check of the form reports it.
+    // If the value is not a list, the check of the structure reports it.
     if let Some(list) = root.entry("NegativeEvents").or_insert_with(|| json!([])).as_array_mut() {
         list.extend(events);
     }
 }
 
-/// Whether a path is above a group, or equals it.
 fn is_above(path: &str, group: &str) -> bool {
     group.strip_prefix(path).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
 }
 
-/// Inserts a measured value below `group`.
 fn insert(root: &mut Map<String, Value>, group: &str, name: &str, value: Value) -> Result<(), String> {
     let mut object = root;
     for step in group.split('.') {
         let next = object.entry(step).or_insert_with(|| Value::Object(Map::new()));
-        // If this place contains something other than an object, the check of the form reports it.
+        // If the value is not an object, the check of the structure reports it.
         let Some(next) = next.as_object_mut() else { return Ok(()) };
         object = next;
     }
@@ -150,8 +148,7 @@ fn insert(root: &mut Map<String, Value>, group: &str, name: &str, value: Value) 
     Ok(())
 }
 
-/// Returns faults that show that the manufacturer's part belongs to another battery. Only Catena-X states the rated
-/// values.
+/// Returns faults if the rated values belong to another battery. Only Catena-X states rated values.
 fn other_battery(rated: Rated, document: &Value) -> impl Iterator<Item = String> {
     let both = [
         ("capacity", rated.capacity_ah, "Ah by the configuration (cell model and strings)"),

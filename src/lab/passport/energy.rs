@@ -1,28 +1,23 @@
 //! Computes the energy of a discharge at the configured load.
 //!
-//! Input: model, load, capacity (Ah) and resistance ratio of a cell. Output: the energy (Wh) until a given charge (Ah)
-//! has been delivered. The voltage under load follows from the usable capacity ([`usable_ah`]): a table contains the
-//! charge q(v) that a discharge delivers down to each voltage v. The energy is the sum of v dq over this table. Any
-//! additional charge is delivered at the cut-off voltage.
+//! A table lists the charge q(v) that the cell delivers until its voltage under load falls to v ([`usable_ah`]). The
+//! energy is the sum of v dq over this table. Further charge is delivered at the cut-off voltage.
 
 use crate::cell::CellModel;
 use crate::health::UsableConfig;
 use crate::health::usable::usable_ah;
 
-/// Number of voltages of the table: about 8 mV apart in a lithium-ion cell.
+/// Number of voltages in the table, about 8 mV apart for a lithium-ion cell.
 const VOLTAGES: u32 = 200;
 
-/// A full cell at the configured load.
 #[derive(Debug)]
 pub(super) struct Discharge {
-    /// Points of the discharge, in order of falling voltage. Each point has a voltage (V) and the charge (Ah) that the
-    /// cell delivers until its voltage falls to this value.
+    /// Falling voltages (V), each with the charge (Ah) that the cell delivers until then.
     points: Vec<(f64, f64)>,
     cutoff_v: f64,
 }
 
 impl Discharge {
-    /// Computes the discharge of a cell from its capacity (Ah) and its resistance relative to new.
     pub(super) fn new(model: &CellModel, load: &UsableConfig, capacity_ah: f64, resistance_ratio: f64) -> Self {
         let top_v = model.voltage_max_v.max(load.cutoff_v);
         let voltage_v = |step: u32| top_v - (top_v - load.cutoff_v) * f64::from(step) / f64::from(VOLTAGES);
@@ -36,7 +31,6 @@ impl Discharge {
         Self { points: (0..=VOLTAGES).map(point).collect(), cutoff_v: load.cutoff_v }
     }
 
-    /// Returns the energy (Wh) until `charge_ah` has been delivered.
     pub(super) fn energy_wh(&self, charge_ah: f64) -> f64 {
         let mut energy_wh = 0.0;
         let mut delivered_ah = 0.0;
@@ -56,7 +50,7 @@ mod tests {
     use crate::cell::AgedOcv;
     use crate::cell::model::{Branch, Table};
 
-    /// A cell with the open-circuit voltage 3 V + 1.2 V x SOC, almost without resistance.
+    /// Creates a cell with the open-circuit voltage 3 V + 1.2 V x SOC, almost without resistance.
     fn model() -> CellModel {
         let row = |value: f64| Table { values: vec![vec![value; 2]] };
         CellModel {

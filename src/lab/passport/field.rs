@@ -1,11 +1,9 @@
 //! Lists the values of a battery passport that packwatch can determine: name, unit, definition and place in each
-//! standard.
-//!
-//! This list decides which value is written to which member; `docs/src/lab/passport.md` explains the choice.
+//! standard. `docs/src/lab/passport.md` explains the choice of the places.
 
 use serde_json::Value;
 
-/// Group of the temperatures in IDTA, which share one time.
+/// Group of the temperatures in IDTA. They share one time.
 const TEMPERATURES: &str = "TemperatureInformation";
 
 /// Form of a passport.
@@ -52,11 +50,11 @@ pub enum Field {
     TimeColdCharging,
     /// Capacity (Ah).
     RemainingCapacity,
-    /// Capacity lost (%) of the rated capacity.
+    /// Capacity lost, % of the rated capacity.
     CapacityFade,
-    /// Largest resistance increase of any cell (%) of the resistance of a new cell.
+    /// Largest resistance increase of any cell, % of the resistance of a new cell.
     CellResistanceIncrease,
-    /// Resistance increase of all cells together (%) of the resistance of the new cells.
+    /// Resistance increase of all cells together, % of the resistance of the new cells.
     PackResistanceIncrease,
     /// Highest ohmic resistance of any cell (ohm).
     CellResistance,
@@ -64,18 +62,15 @@ pub enum Field {
     PackResistance,
     /// Energy of a full discharge (kWh).
     RemainingEnergy,
-    /// Energy of a full discharge (%) of the certified energy.
+    /// Energy of a full discharge, % of the certified energy.
     StateOfCertifiedEnergy,
 }
 
-/// Place of a value in the JSON: member names that lead to the number and to its time.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Place {
-    /// Members that contain both the number and its time.
+    /// Path of the object that contains the number and its time.
     pub(super) group: &'static str,
-    /// Member with the number.
     pub(super) value: &'static str,
-    /// Member with the time.
     pub(super) time: &'static str,
 }
 
@@ -90,7 +85,7 @@ impl Place {
 }
 
 impl Field {
-    /// All values, in the order in which they are listed.
+    /// All values, in the order of the details.
     pub const ALL: [Self; 17] = [
         Self::FullCycles,
         Self::CapacityThroughput,
@@ -111,7 +106,6 @@ impl Field {
         Self::StateOfCertifiedEnergy,
     ];
 
-    /// Name, unit and definition.
     pub(super) const fn meaning(self) -> (&'static str, &'static str, &'static str) {
         match self {
             Self::FullCycles => (
@@ -162,7 +156,6 @@ impl Field {
         }
     }
 
-    /// Place in a passport; `None` = the standard has no place for the value.
     pub(super) const fn place(self, standard: Standard) -> Option<Place> {
         let (idta, catena_x) = match self {
             Self::FullCycles => {
@@ -209,14 +202,14 @@ impl Field {
     /// Returns the number for a passport. Both standards count whole cycles.
     pub(super) fn number(self, value: f64) -> Value {
         match self {
-            // Whole numbers below 2^53 are exact.
+            // Integers below 2^53 are exact.
             Self::FullCycles => Value::from(value.floor().max(0.0) as u64),
             _ => Value::from(rounded(value)),
         }
     }
 }
 
-/// Rounds to seven significant digits. The rounding error is far below every standard deviation. A zero is positive.
+/// Rounds to seven significant digits. The error is far below every standard deviation. A zero is positive.
 pub(super) fn rounded(value: f64) -> f64 {
     format!("{value:.6e}").parse().unwrap_or(value) + 0.0
 }

@@ -1,21 +1,20 @@
-//! Detects charge that a replay did not see because the current was unknown.
+//! Detects charge that a replay did not measure because the current was unknown.
 //!
-//! Input: events and estimates of a replay, in order. Output: lost seconds, or the first gap in which an unknown charge
-//! may have moved. A replay reports a missing current in these ways:
+//! A replay reports a missing current in these ways:
 //!
 //! | report | charge |
 //! | --- | --- |
 //! | the current's signal turns bad or stale | lost until the signal is good again, except while its last reading may be used |
-//! | the buses fall asleep | none: the core reports sleep only while no current flows |
-//! | a gap: nothing was recorded | none if the buses slept or the pack rested before; otherwise unknown |
+//! | the buses fall asleep | no charge: the core reports sleep only while no current flows |
+//! | a gap: nothing was recorded | no charge if the buses slept or the pack rested before; otherwise unknown |
 //!
-//! Assumption: if the pack rests when the recording stops, it rests until the recording continues. If the pack was used
-//! in such a gap but rested at both ends, this use cannot be detected.
+//! Assumption: if the pack rests when the recording stops, it rests until the recording continues. If it is used in
+//! such a gap but rests at both ends, the use cannot be detected.
 
 use crate::monitor::{Estimate, Event, EventKind};
 use crate::quantity::{Channel, Fault, Timestamp};
 
-/// Limits for the readings of a replay's current and voltages.
+/// Limits for current and voltage readings.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct ReadingLimits {
     /// Maximum age of a current reading that is still used (s).
@@ -26,19 +25,18 @@ pub struct ReadingLimits {
     pub rest_a: f64,
 }
 
-/// Losses so far.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Losses {
     limits: ReadingLimits,
     /// Latest known current (A) per string.
     current_a: Option<f64>,
-    /// Start of the loss that has not ended; `None` = no loss is open.
+    /// Start of a loss that has not ended; `None` = the current is known.
     lost_since: Option<Timestamp>,
     is_asleep: bool,
-    /// End of the latest time in which nothing was recorded and no charge moved.
+    /// End of the latest period without recording in which no charge moved.
     paused_until: Option<Timestamp>,
     lost_s: f64,
-    /// Describes the first gap in which an unknown charge may have moved.
+    /// First gap in which an unknown charge may have moved, as text.
     gap: Option<String>,
 }
 
@@ -47,7 +45,7 @@ impl Losses {
         Self { limits, ..Self::default() }
     }
 
-    /// Discards earlier losses, because another pack was connected. A loss that has not ended counts from now.
+    /// Discards earlier losses because another pack was connected. A loss that has not ended counts from `now`.
     pub(super) fn restart(&mut self, now: Timestamp) {
         self.lost_since = self.lost_since.map(|since| since.max(now));
         (self.lost_s, self.gap) = (0.0, None);
@@ -63,8 +61,8 @@ impl Losses {
     pub(super) fn take_event(&mut self, event: &Event) {
         match event.kind {
             EventKind::SignalBad { channel: Channel::Current, fault } => {
-                // If the signal is stale, its last reading was used until now. With any other fault, the last good
-                // reading may still be used for a limited time from now on.
+                // The last reading of a stale signal was used until now. With other faults, the last good reading may
+                // still be used for a limited time.
                 let held_s = if fault == Fault::Stale { 0.0 } else { self.limits.current_age_s };
                 self.lost_since.get_or_insert(event.time.plus_secs(held_s));
             }
@@ -85,12 +83,12 @@ impl Losses {
         }
     }
 
-    /// Whether a resting pack may have this current (A) per string.
+    /// Whether the pack rests at this current (A per string).
     pub(super) fn is_rest(&self, current_a: f64) -> bool {
         current_a.abs() <= self.limits.rest_a
     }
 
-    /// Whether, after `from`, there was a time in which nothing was recorded and no charge moved.
+    /// Whether recording has paused since `from` while no charge moved.
     pub(super) fn has_paused_since(&self, from: Timestamp) -> bool {
         self.paused_until.is_some_and(|until| until > from)
     }
@@ -105,7 +103,7 @@ impl Losses {
         }
     }
 
-    /// Returns why the charge of the record is unknown; `None` = the charge is known. The record ends at `end`. Its
+    /// Returns the reason why the charge of the record is unknown; `None` = it is known. The record ends at `end`. Its
     /// charges and discharges last `used_s` in total.
     pub(super) fn finish(&mut self, end: Timestamp, used_s: f64) -> Option<String> {
         self.end_loss(end);
@@ -115,10 +113,9 @@ impl Losses {
     }
 }
 
-/// Whether `lost_s` is so large a share of `used_s` that the sum over this time is unknown.
+/// Whether `lost_s` is too large a share of `used_s` for a known sum.
 pub(super) fn is_too_much(lost_s: f64, used_s: f64) -> bool {
-    // Maximum share of the charging and discharging time without a current reading. This share tolerates single lost
-    // frames, and causes an error far below the gain error of a current sensor.
+    // This share tolerates single lost frames. Its error is far below the gain error of a current sensor.
     lost_s > 1e-3 * used_s
 }
 

@@ -1,9 +1,9 @@
 //! Collects the record of the connected pack from a store or a replay: sums of half-cycles, energy, latest learned
 //! values, last state.
 //!
-//! Times are nanoseconds since 1970, on the wall clock of a store or the log's clock of a replay. Rows of a store and
-//! events of a replay use the same field names, so both give the same sums. Energy needs every voltage, which a store
-//! does not contain. If a part of a sum is missing, [`Record::gap`] states the reason.
+//! Times are nanoseconds since 1970, on the wall clock of a store or on the log's clock of a replay. A store's rows and
+//! a replay's events use the same field names, so both give the same sums. Only a replay gives the energy, because a
+//! store does not contain every voltage. If a part of a sum is missing, [`Record::gap`] states the reason.
 
 use super::losses::{Losses, ReadingLimits, is_too_much};
 use crate::fields::Fields;
@@ -16,7 +16,6 @@ use crate::store::{HistoryEntry, HistoryExtent, HistoryQuery, HistoryReader, His
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Learned {
     pub(super) at_ns: i64,
-    /// Capacity (Ah).
     pub(super) capacity: (f64, f64),
     /// Usable capacity (Ah) with the time of the latest half-cycle that gave it; `None` = no load is configured.
     pub(super) usable: Option<(i64, (f64, f64))>,
@@ -24,41 +23,36 @@ pub(super) struct Learned {
     pub(super) resistance: (f64, f64),
 }
 
-/// A cell's part of a record.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct CellRecord {
     pub(super) moved: Throughput,
     half_cycles: u64,
     pub(super) learned: Option<Learned>,
-    /// In a replay: power of the last reading of voltage and current.
+    /// In a replay: power at the last reading of voltage and current.
     power: Option<Power>,
 }
 
-/// Power of a cell at one time.
 #[derive(Debug, Clone, Copy)]
 struct Power {
     time: Timestamp,
-    /// Absolute power (W).
     power_w: f64,
-    /// Whether the pack rests.
     is_rest: bool,
 }
 
-/// Energy of a replay: integral of the power of all cells of one string.
+/// Energy of a replay, integrated over the power of all cells of one string.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Energy {
-    /// Energy of charges and discharges (Wh), added.
+    /// Energy of charges plus discharges (Wh).
     pub(super) energy_wh: f64,
-    /// End of the last step that was integrated.
     pub(super) until: Option<Timestamp>,
-    /// Integrated time (s) all cells added.
+    /// Integrated time, summed over all cells (s).
     counted_s: f64,
-    /// Time in use without a voltage (s) all cells added.
+    /// Time in use without a voltage, summed over all cells (s).
     lost_s: f64,
 }
 
 impl Energy {
-    /// Returns why the energy is unknown; `None` = the energy is known.
+    /// Returns the reason why the energy is unknown; `None` = it is known.
     pub(super) fn gap(&self) -> Option<&'static str> {
         is_too_much(self.lost_s, self.counted_s).then_some("voltages are missing from the record while current flowed")
     }
@@ -68,16 +62,14 @@ impl Energy {
 #[derive(Debug, Default)]
 pub struct Record {
     pub(super) cells: Vec<CellRecord>,
-    /// End of the last half-cycle. If the clock was set back, this is not the latest time.
+    /// End of the last half-cycle. It is not the latest time if the clock was set back.
     pub(super) moved_until_ns: Option<i64>,
-    /// Why the half-cycles do not contain all charge; `None` = they do.
+    /// Reason why charge is missing from the half-cycles; `None` = no charge is missing.
     pub(super) gap: Option<String>,
     /// Energy of charges and discharges; `None` = unknown, because the record comes from a store.
     pub(super) energy: Option<Energy>,
     limits: ReadingLimits,
-    /// Losses of a replay.
     losses: Losses,
-    /// The last state, with its time on the record's clock.
     pub(super) state: Option<(i64, Box<Snapshot>)>,
 }
 
@@ -95,7 +87,7 @@ impl Record {
         if let Some(broken) = reader.verify()?.broken {
             return Err(format!("the history was changed: {broken}; packwatch does not write a passport from it"));
         }
-        // Read the state before the rows: a daemon may add rows in between.
+        // Read the state first, because a daemon may add rows while they are read.
         let state = reader.dated_snapshot().map(|(at, state)| (at, Box::new(state)));
         let extent = reader.extent()?;
         let mut record = Self { state, ..Self::default() };
@@ -110,8 +102,8 @@ impl Record {
         Ok(record)
     }
 
-    /// Compares the half-cycles in a store with the number that was counted when they were written. If the store has
-    /// deleted rows, but the state counts all half-cycles, the sums of the state are used instead of the rows.
+    /// Compares the half-cycles in a store with the number counted when they were written. If the store has deleted
+    /// rows but the state counts all half-cycles, the sums of the state replace the rows.
     fn note_missing_rows(&mut self, extent: &HistoryExtent) {
         let HistoryExtent { half_cycles, deleted_half_cycles: deleted, written_half_cycles, .. } = *extent;
         let counted = self.snapshot().map_or(0, Snapshot::half_cycles);
@@ -134,7 +126,7 @@ impl Record {
         }
     }
 
-    /// Records why charge is missing; the first reason counts.
+    /// Records why charge is missing. Only the first reason is kept.
     pub fn note_gap(&mut self, reason: String) {
         self.gap.get_or_insert(reason);
     }
@@ -153,8 +145,8 @@ impl Record {
 
     /// Receives the outputs of a replay, in order.
     pub fn take(&mut self, out: &Outputs) {
-        // An event may be a gap. Estimates with an earlier time precede the gap and show the current before it;
-        // estimates with the same time follow it.
+        // An event may be a gap. Estimates with an earlier time belong before the event, and estimates with the same
+        // time belong after the event.
         let mut estimates = out.estimates.iter().peekable();
         for event in &out.events {
             while let Some(estimate) = estimates.next_if(|estimate| estimate.time < event.time) {
@@ -165,7 +157,6 @@ impl Record {
         estimates.for_each(|estimate| self.take_estimate(estimate));
     }
 
-    /// Receives an event of a replay.
     fn take_event(&mut self, event: &Event) {
         let at_ns = event.time.nanos();
         self.losses.take_event(event);
@@ -183,7 +174,6 @@ impl Record {
         }
     }
 
-    /// Receives an estimate of a replay: adds the energy since the previous estimate of the cell.
     fn take_estimate(&mut self, estimate: &Estimate) {
         self.losses.take_estimate(estimate);
         let longest_s = self.limits.voltage_age_s;
@@ -212,7 +202,7 @@ impl Record {
         self.state = Some((state.time.nanos(), Box::new(state)));
     }
 
-    /// The last state.
+    /// Returns the last state.
     pub fn snapshot(&self) -> Option<&Snapshot> {
         self.state.as_ref().map(|(_, state)| &**state)
     }
@@ -246,20 +236,18 @@ impl Record {
         cell.learned = Some(Learned { at_ns, capacity, usable, resistance });
     }
 
-    /// Returns the charge moved by a pack with this number of strings (Ah) and the difference between the durations of
-    /// discharges and charges (h). The values come from the cell that moved the largest charge, so a missing row of
+    /// Returns the charge moved by a pack with this number of strings (Ah), and the difference between the durations of
+    /// discharges and charges (h). Both come from the cell that moved the largest charge, so that a missing row of
     /// another cell does not reduce them.
     pub(super) fn moved(&self, strings: f64) -> (f64, f64) {
         let most = self.fullest();
         (strings * most.charge_ah, (most.discharging_s - most.charging_s).abs() / 3600.0)
     }
 
-    /// Returns the number of recorded half-cycles.
     pub(super) fn half_cycles(&self) -> u64 {
         self.cells.iter().map(|cell| cell.half_cycles).max().unwrap_or(0)
     }
 
-    /// Returns the sums of the cell that moved the largest charge.
     fn fullest(&self) -> Throughput {
         let sums = self.cells.iter().map(|cell| cell.moved);
         sums.max_by(|a, b| a.charge_ah.total_cmp(&b.charge_ah)).unwrap_or_default()
@@ -326,8 +314,8 @@ mod tests {
     #[test]
     fn energy_counts_both_directions_but_no_gaps() {
         let mut record = Record::of_replay(LIMITS);
-        // The record has 7.2 W for 50 s in each direction, two minutes without data in between, and a voltage without a
-        // current.
+        // The record has 7.2 W for 50 s in each direction, two minutes without data in between, and at the end a
+        // voltage without a current.
         for (time_s, current_a) in
             [(0.0, 2.0), (50.0, 2.0), (180.0, -2.0), (230.0, -2.0), (250.0, f64::NAN), (260.0, 2.0)]
         {

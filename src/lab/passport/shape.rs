@@ -1,9 +1,9 @@
-//! Defines the form that a standard requires of a JSON document, and checks documents against this form.
+//! Defines the structure that a standard requires of a JSON document, and checks documents against it.
 //!
 //! Input: rows of path and kind, for example `identification.codes[].key|value`. In a path, `|` separates members of
-//! the same form, `[]` is a list, and `{}` is a list without duplicates. If a member may be missing, the first row that
-//! names it marks it with `?`. Output: every fault with its path, and the required members that are missing. A member
-//! that the standard does not define is also a fault, because a misspelt name would otherwise stay unnoticed.
+//! the same structure, `[]` is a list, and `{}` is a list without duplicates. If a member may be missing, the first row
+//! that names it marks it with `?`. A member that the standard does not define is a fault, because a misspelt name
+//! would otherwise stay unnoticed.
 
 use std::collections::HashSet;
 use std::ops::Range;
@@ -35,15 +35,14 @@ pub(super) enum Kind {
     Choice(&'static [&'static str]),
     /// One of the given texts, or `customKey:` followed by a word.
     LocalKey(&'static [&'static str]),
-    /// A list of documents: content, contentType, header.
+    /// A list of documents, each with content, contentType and header.
     Documents,
-    /// A list of facilities, each a business partner number that starts with BPNA.
+    /// A list of facilities. Each is a business partner number that starts with BPNA.
     Facilities,
     /// A measured value: value and time.
     Reading,
 }
 
-/// A part of a document.
 #[derive(Debug)]
 pub(super) enum Shape {
     /// A leaf.
@@ -54,7 +53,6 @@ pub(super) enum Shape {
     List { is_set: bool, item: Box<Shape> },
 }
 
-/// A member of an object.
 #[derive(Debug)]
 pub(super) struct Member {
     name: String,
@@ -62,17 +60,13 @@ pub(super) struct Member {
     shape: Shape,
 }
 
-/// Result of a check.
 #[derive(Debug, Default, PartialEq)]
 pub(super) struct Verdict {
-    /// Faults, each with its path.
     pub(super) faults: Vec<String>,
-    /// Paths of required members that are missing.
     pub(super) missing: Vec<String>,
 }
 
 impl Shape {
-    /// Creates the form that these rows describe.
     pub(super) fn of_rows(rows: &[(&str, Kind)]) -> Self {
         let mut root = Self::Object(Vec::new());
         for (path, kind) in rows {
@@ -81,7 +75,7 @@ impl Shape {
         root
     }
 
-    /// Adds a leaf below this object. If the path has alternatives, adds one leaf for each.
+    /// Adds a leaf for each alternative in the path below this object.
     fn add(&mut self, path: &str, kind: Kind) {
         let (steps, rest) = path.split_once('.').unwrap_or((path, ""));
         let Self::Object(members) = self else { return };
@@ -115,8 +109,8 @@ impl Shape {
         }
     }
 
-    /// A document with every member that is not measured: `null` for each value, and one item in each list. `None` = every
-    /// member is measured.
+    /// Returns a document with every member that is not measured: `null` for each value, and one item in each list.
+    /// `None` = every member is measured.
     pub(super) fn template(&self, path: &str, is_measured: &dyn Fn(&str) -> bool) -> Option<Value> {
         Some(match self {
             _ if is_measured(path) => return None,
@@ -133,8 +127,8 @@ impl Shape {
         })
     }
 
-    /// Checks a document. A missing object counts as one missing member. If `is_opened` returns true for the path of
-    /// the object, the required members of the object count instead.
+    /// Checks a document. A missing object counts as one missing member. If `is_opened` returns true for its path, its
+    /// required members are reported instead.
     pub(super) fn check(&self, document: &Value, is_opened: &dyn Fn(&str) -> bool) -> Verdict {
         let mut verdict = Verdict::default();
         self.check_at("", document, is_opened, &mut verdict);
@@ -192,7 +186,6 @@ fn check_object(
     }
 }
 
-/// Returns the path of a member.
 pub(super) fn joined(path: &str, name: &str) -> String {
     if path.is_empty() { name.to_owned() } else { format!("{path}.{name}") }
 }
@@ -201,7 +194,6 @@ fn named(path: &str) -> &str {
     if path.is_empty() { "the document" } else { path }
 }
 
-/// Returns a short description of a value of the wrong type.
 fn short(value: &Value) -> String {
     match value {
         Value::Object(_) => "an object".to_owned(),
@@ -211,7 +203,7 @@ fn short(value: &Value) -> String {
 }
 
 impl Kind {
-    /// Returns the allowed values; `None` = the value is allowed.
+    /// Returns the allowed values if the value is not allowed; `None` = it is allowed.
     fn refuses(self, value: &Value) -> Option<String> {
         let number = |is_good: &dyn Fn(f64) -> bool| value.as_f64().is_some_and(is_good);
         let text = |is_good: &dyn Fn(&str) -> bool| value.as_str().is_some_and(is_good);
@@ -235,14 +227,14 @@ impl Kind {
                 let is_key = |text: &str| all.contains(&text) || text.strip_prefix("customKey:").is_some_and(is_word);
                 (text(&is_key), format!("one of {}, customKey:WORD", all.join(", ")))
             }
-            // Leaves do not have these kinds.
+            // Leaves never have these kinds.
             Self::Documents | Self::Facilities | Self::Reading => (true, String::new()),
         };
         (!is_good).then_some(allowed)
     }
 }
 
-/// Whether a text has a form. In the form, `0` stands for any digit; other characters stand for themselves.
+/// Whether a text has a form. In the form, `0` matches any digit; other characters match themselves.
 fn has_form(text: &str, form: &str) -> bool {
     let fits = |(byte, expected): (u8, u8)| if expected == b'0' { byte.is_ascii_digit() } else { byte == expected };
     text.len() == form.len() && text.bytes().zip(form.bytes()).all(fits)
@@ -289,7 +281,6 @@ fn is_zone(zone: &str) -> bool {
     matches!(zone, "" | "Z") || zone.strip_prefix(['+', '-']).is_some_and(is_offset)
 }
 
-/// Returns the number in these digits; other characters give 0.
 fn number_in(text: &str, digits: Range<usize>) -> u32 {
     text.get(digits).and_then(|digits| digits.parse().ok()).unwrap_or(0)
 }
@@ -377,7 +368,7 @@ mod tests {
         keys.push("17".to_owned());
         let document = json!({ "name": "a", "size": { "unit": "mm" }, "keys": keys, "papers": [], "use": { "cycles": {
             "value": 1, "time": "2026-01-31T12:00:00Z" } } });
-        // Comparing every pair would take minutes.
+        // A comparison of every pair would take minutes.
         let start = std::time::Instant::now();
         assert_eq!(check(&document).faults, ["keys[200000]: found twice, must occur once"]);
         assert!(start.elapsed().as_secs() < 10, "{:?}", start.elapsed());

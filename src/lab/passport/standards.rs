@@ -1,4 +1,4 @@
-//! Defines the two standards as rows of path and kind, derived from their aspect models.
+//! Defines the structure of the two standards as rows of path and kind, derived from their aspect models.
 //!
 //! Sources: IDTA 02035-5 "Digital Battery Passport, Part 5: Product Condition" 1.0.1 (aspect model
 //! `product_condition`), and Catena-X `io.catenax.battery.battery_pass` 6.0.0. Units follow the aspect models; see
@@ -82,11 +82,10 @@ const SOURCE: Kind = Choice(&[
     "Other",
 ]);
 
-/// Submodel Product Condition.
 const PRODUCT_CONDITION: &[(&str, Kind)] = &[
     ("EnergyThroughput?.EnergyThroughputValue", Number),
     ("CapacityThroughput?.CapacityThroughputValue", Number),
-    // Largest unsigned integer of 32 bits. The aspect model uses this type for the number of cycles.
+    // The aspect model counts cycles in an unsigned integer of 32 bits.
     ("NumberOfFullCycles.NumberOfFullCyclesValue", Within(0.0, 4_294_967_295.0)),
     ("StateOfCertifiedEnergy?.StateOfCertifiedEnergyValue", Number),
     ("RemainingEnergy?.RemainingEnergyValue", Number),
@@ -107,7 +106,6 @@ const PRODUCT_CONDITION: &[(&str, Kind)] = &[
     ("RemainingRoundTripEnergyEfficiency|StateOfCharge.LastUpdate", Time),
 ];
 
-/// Catena-X battery pass.
 const BATTERY_PASS: &[(&str, Kind)] = &[
     ("identification.category", Choice(&["SLI", "LMT", "EV", "industrial", "portable", "incorporated"])),
     ("identification.idDmc|chemistry", Text),
@@ -232,7 +230,6 @@ const BATTERY_PASS: &[(&str, Kind)] = &[
     ("handling.applicable", Flag),
 ];
 
-/// Returns the form of a standard.
 pub(super) fn shape(standard: Standard) -> Shape {
     Shape::of_rows(match standard {
         Standard::ProductCondition => PRODUCT_CONDITION,

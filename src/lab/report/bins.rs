@@ -1,15 +1,13 @@
-//! Stores a record of any length in a limited number of bins. When all bins are used, neighbouring bins are joined.
+//! Stores a record of any length in a limited number of bins. When all bins are used, pairs of neighbouring bins are
+//! joined.
 
 /// Maximum number of bins: about two per pixel column of a wide picture.
 const MOST: usize = 2048;
 
-/// Content of a bin.
 pub(super) trait Bin: Clone + Default {
-    /// Adds the content of the next bin to this bin.
     fn join(&mut self, later: &Self);
 }
 
-/// Bins of equal width, starting at the first time.
 #[derive(Debug, Clone)]
 pub(super) struct Bins<B> {
     begin_s: f64,
@@ -22,7 +20,7 @@ impl<B: Bin> Bins<B> {
         Self { begin_s, width_s: 1.0, bins: Vec::new() }
     }
 
-    /// Returns the bin of a time. A time before the first one (after a clock was set back) belongs to the first bin.
+    /// Returns the bin of a time. If a clock was set back, earlier times belong to the first bin.
     pub(super) fn at(&mut self, time_s: f64) -> &mut B {
         let after_s = (time_s - self.begin_s).max(0.0);
         while after_s / self.width_s >= MOST as f64 {
@@ -45,13 +43,11 @@ impl<B: Bin> Bins<B> {
         self.bins = joined.collect();
     }
 
-    /// Returns the bins with the times of their centres.
     pub(super) fn iter(&self) -> impl Iterator<Item = (f64, &B)> {
         let middle = |index: usize| self.begin_s + (index as f64 + 0.5) * self.width_s;
         self.bins.iter().enumerate().map(move |(index, bin)| (middle(index), bin))
     }
 
-    /// Width of a bin (s).
     pub(super) fn width_s(&self) -> f64 {
         self.width_s
     }

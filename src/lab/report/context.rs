@@ -1,4 +1,4 @@
-//! Holds what a page shows in addition to the data: title, configuration, reference and provenance.
+//! Holds the inputs of a page in addition to the data: title, configuration, reference and provenance.
 
 use super::reference::Reference;
 use crate::cell_faults::{CellFaultDetector, Imbalance, UnknownImbalance};
@@ -7,20 +7,20 @@ use crate::config::cell_model::SourcedModel;
 use crate::health::UseRecord;
 use crate::quantity::CellIndex;
 
-/// Content of a page in addition to the data.
+/// Inputs of a page in addition to the data.
 #[derive(Debug, Default)]
 pub struct PageContext<'a> {
     /// Title shown on the page.
     pub title: String,
     /// Configuration with thresholds and rated capacity; `None` = unknown.
     pub config: Option<&'a Config>,
-    /// Text of the configuration file, for the end of the page.
+    /// Text of the configuration file, shown at the end of the page.
     pub config_text: Option<String>,
     /// Model of the cells at the end of the data; `None` = unknown.
     pub model: Option<SourcedModel>,
     /// Findings about single cells; `None` = the cells were not compared.
     pub diagnosis: Option<&'a CellFaultDetector>,
-    /// What the differences between the cells cost the pack; `None` = the cells were not compared.
+    /// Charge lost because the cells differ; `None` = the cells were not compared.
     pub imbalance: Option<Result<Imbalance, UnknownImbalance>>,
     /// How the pack was used; `None` = unknown.
     pub use_record: Option<UseRecord>,
@@ -31,7 +31,7 @@ pub struct PageContext<'a> {
 }
 
 impl PageContext<'_> {
-    /// Rated capacity of a cell (Ah); `None` = no configuration.
+    /// Returns the rated capacity of a cell (Ah); `None` = no configuration.
     pub(super) fn rated_ah(&self, cell: usize) -> Option<f64> {
         let cell = CellIndex(u16::try_from(cell).ok()?);
         self.config.map(|config| config.monitor.model_of(cell).rated_capacity_ah)

@@ -17,13 +17,12 @@ use crate::store::{HistoryEntry, HistoryQuery, HistoryReader, HistoryTable};
 /// Origin of the data.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Origin {
-    /// The history of a store, with learned values and alarms but without samples.
+    /// The history of a store: learned values and alarms, no samples.
     Store,
     /// A replay, which contains all data.
     Replay,
 }
 
-/// A charge or discharge of a cell.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct HalfCycleRecord {
     pub(super) time_s: f64,
@@ -34,26 +33,23 @@ pub(super) struct HalfCycleRecord {
     pub(super) mean_temperature_c: Option<f64>,
 }
 
-/// Estimates of a cell after a half-cycle.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct CapacityRecord {
     pub(super) time_s: f64,
     pub(super) cell: usize,
     /// Capacity from this half-cycle alone (Ah).
     pub(super) measured_ah: Option<f64>,
-    /// Standard deviation of `measured_ah` (Ah).
     pub(super) measured_std_ah: Option<f64>,
     /// Learned capacity (Ah): mean and standard deviation.
     pub(super) capacity_ah: (f64, f64),
     pub(super) usable_ah: Option<(f64, f64)>,
-    /// Losses of lithium, of the negative electrode and of the positive electrode, as fractions. Each loss has a mean
-    /// and a standard deviation.
+    /// Lost fractions of the lithium, the negative electrode and the positive electrode: mean and standard deviation.
     pub(super) losses: Option<[(f64, f64); 3]>,
     /// Resistance relative to new: mean and standard deviation.
     pub(super) resistance: (f64, f64),
 }
 
-/// A charge that covered the SOC window of the recharge period, or enough of it.
+/// A charge that covered enough of the SOC window of the recharge period.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct RechargeRecord {
     pub(super) time_s: f64,
@@ -62,7 +58,6 @@ pub(super) struct RechargeRecord {
     pub(super) normalised_s: Option<(f64, f64)>,
 }
 
-/// A change of an alarm.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct AlarmRecord {
     pub(super) time_s: f64,
@@ -75,20 +70,16 @@ pub(super) struct AlarmRecord {
     pub(super) threshold: Option<f64>,
 }
 
-/// A change of the cell model that the monitor learns.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct ModelRecord {
     pub(super) time_s: f64,
     /// Name of a [`ModelState`](crate::monitor::ModelState).
     pub(super) state: String,
-    /// Learned capacity of the mean cell (Ah): mean and standard deviation. `None` = nothing was learned, so the
-    /// label's capacity applies.
+    /// Learned capacity of the mean cell (Ah): mean and standard deviation. `None` = the label's capacity applies.
     pub(super) capacity_ah: Option<(f64, f64)>,
-    /// Root mean square of the residuals (V).
     pub(super) residual_v: Option<f64>,
-    /// A chemistry that fits better; empty = the label's chemistry fits.
+    /// Chemistry that fits better; empty = the label's chemistry fits.
     pub(super) chemistry: String,
-    /// Whether the previous model applies again.
     pub(super) is_taken_back: bool,
 }
 
@@ -115,9 +106,8 @@ pub struct Data {
     /// Time and text of other events: resets, replaced packs, and a clock that was set back.
     pub(super) incidents: Vec<(f64, String)>,
     pub(super) trace: Trace,
-    /// Size of each finding in a replay when it was first reported, by kind and first cell.
+    /// In a replay, size of each finding when it was first reported, by kind and first cell.
     pub(super) first_sizes: BTreeMap<(CellFaultKind, CellIndex), ScalarGaussian>,
-    /// Cells whose estimate is untrusted at the end.
     pub(super) untrusted: BTreeSet<usize>,
     /// Offset of the current sensor (A): mean and standard deviation.
     pub(super) current_offset: Option<(f64, f64)>,
@@ -164,12 +154,11 @@ impl Data {
         self.source.doubt = Some(why);
     }
 
-    /// Sets the learned offset of the current sensor (A): reading minus true current, and the standard deviation.
+    /// Sets the learned offset of the current sensor (A): mean and standard deviation of reading minus true current.
     pub fn set_current_offset(&mut self, offset: Option<(f64, f64)>) {
         self.current_offset = offset;
     }
 
-    /// Adds a row of a store.
     fn take_entry(&mut self, entry: &HistoryEntry) {
         let time_s = entry.wall_ns as f64 * 1e-9;
         self.span(time_s);
@@ -186,7 +175,7 @@ impl Data {
                 let colon = if detail.is_empty() { "" } else { ": " };
                 self.incidents.push((time_s, format!("{reason}{of}{colon}{detail}")));
             }
-            // The forecast is computed again for the report. The report shows the latest energy from the status.
+            // The report computes the forecast again, and takes the latest energy from the status.
             HistoryTable::RemainingLife | HistoryTable::Outlook => {}
         }
     }
@@ -206,7 +195,6 @@ impl Data {
             EventKind::Finding(found) => {
                 found.cells.map(|cells| self.first_sizes.entry((found.kind, cells.0)).or_insert(found.size));
             }
-            // The alarm `estimate_untrusted` shows the change.
             EventKind::Trust { cell, trusted: true, .. } => {
                 self.untrusted.remove(&cell.index());
             }
@@ -249,8 +237,7 @@ impl Data {
         });
     }
 
-    /// Adds the losses of a cell to the capacity record of the same cell and time. That record is received before the
-    /// losses.
+    /// Adds the losses of a cell to its capacity record of the same time, which arrives before the losses.
     fn take_losses(&mut self, time_s: f64, fields: &Fields) {
         let Some(cell) = cell_of(fields) else { return };
         let [lithium, negative, positive] =
@@ -300,8 +287,7 @@ impl Data {
         self.incidents.push((time_s, what));
     }
 
-    /// Removes the data of the old pack. The report of a replay, like the report of a store, describes the pack that is
-    /// connected at the end.
+    /// Removes the data of the old pack, because a report describes the pack that is connected at the end.
     fn forget_pack(&mut self) {
         self.halves.clear();
         self.learned.clear();
@@ -322,18 +308,15 @@ impl Data {
         self.last_s = self.last_s.max(time_s);
     }
 
-    /// First and last time (s); `None` = no data.
     pub(super) fn ends_s(&self) -> Option<(f64, f64)> {
         (self.first_s <= self.last_s).then_some((self.first_s, self.last_s))
     }
 
-    /// Whether times are dates.
     pub(super) fn is_dated(&self) -> bool {
-        // From this value on, times are dates (s) since 1970. Smaller times count from the start of a log.
+        // Larger times are dates (s since 1970). Smaller times count from the start of a log.
         self.first_s >= 3.0e8
     }
 
-    /// Number of cells with data.
     pub(super) fn cells(&self) -> usize {
         let learned = self.learned.iter().map(|row| row.cell + 1);
         let halves = self.halves.iter().map(|row| row.cell + 1);
@@ -341,7 +324,6 @@ impl Data {
     }
 }
 
-/// Index of the cell, from 0.
 fn cell_of(fields: &Fields) -> Option<usize> {
     fields.whole("cell").map(|cell| cell as usize)
 }

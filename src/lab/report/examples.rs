@@ -1,8 +1,8 @@
 //! Creates data for the tests of the report: a recording of estimates, and a worn pack that gives every card of the
 //! report a value.
 //!
-//! Times are in s; cells count from 0. Standard deviations differ between quantities and between neighbouring cells. A
-//! test can therefore detect that a standard deviation is printed in place of another.
+//! Times are in s; cells count from 0. Standard deviations differ between quantities and between neighbouring cells, so
+//! that a test detects a swapped standard deviation.
 
 use std::path::Path;
 
@@ -12,22 +12,20 @@ use crate::monitor::{Estimate, Event, EventKind, MeasuredValues};
 use crate::quantity::catalogue::{Quantity, RecordedValues};
 use crate::quantity::{CellIndex, Mode, Timestamp};
 
-/// Number of half-cycles of the worn pack. With this number, the remaining life of every cell is known.
+/// Number of half-cycles of the worn pack. It is large enough to forecast the remaining life of every cell.
 pub(super) const HALVES: u16 = 60;
-/// End of the first half-cycle (2023-11-14) (s) since 1970.
+/// End of the first half-cycle (2023-11-14), s since 1970.
 const FIRST_END_S: f64 = 1.7e9;
-/// Time between the ends of two half-cycles (s).
 const HALF_CYCLE_S: f64 = 21_600.0;
 /// Number of estimates of a recording, not counting the first.
 const STEPS: u16 = 60;
 
-/// The demo's configuration: cells with a rated capacity of 2.6 Ah, and the end of life at 2.08 Ah.
+/// Loads the demo's configuration: cells with a rated capacity of 2.6 Ah, and the end of life at 2.08 Ah.
 pub(super) fn config() -> Config {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config/demo.toml");
     config::load(&path).expect("shipped")
 }
 
-/// Evenly spaced estimates of one cell, starting at `first_s`.
 pub(super) fn recording(first_s: f64, length_s: f64) -> Data {
     let mut data = Data::new(Origin::Replay);
     for step in 0..=STEPS {
@@ -51,14 +49,12 @@ pub(super) fn recording(first_s: f64, length_s: f64) -> Data {
     data
 }
 
-/// Standard deviations of the learned values of a cell of the worn pack.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct CellStds {
     pub(super) capacity_ah: f64,
     pub(super) usable_ah: f64,
-    /// Resistance relative to a new cell.
     pub(super) resistance: f64,
-    /// Losses of lithium and of the two electrodes (negative, positive), fractions.
+    /// Losses of lithium and of the electrodes (negative, positive), fractions.
     pub(super) losses: [f64; 3],
 }
 
@@ -70,8 +66,8 @@ pub(super) fn stds(cell: u16) -> CellStds {
 }
 
 /// Creates a pack at the end of [`HALVES`] half-cycles. The last cell has the smallest capacity. The first cell has the
-/// smallest usable capacity and the largest resistance. The second cell has the largest loss of lithium,
-/// the third cell of the negative electrode, and the first cell of the positive electrode.
+/// smallest usable capacity, the largest resistance and the largest loss of the positive electrode. The second cell has
+/// the largest loss of lithium. The third cell has the largest loss of the negative electrode.
 pub(super) fn worn(cells: u16) -> Data {
     let mut data = Data::new(Origin::Replay);
     for half in 0..HALVES {
@@ -90,7 +86,6 @@ pub(super) fn worn(cells: u16) -> Data {
     data
 }
 
-/// End of a half-cycle of the worn pack (s) since 1970.
 pub(super) fn end_s(half: u16) -> f64 {
     FIRST_END_S + HALF_CYCLE_S * f64::from(half)
 }

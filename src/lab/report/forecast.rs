@@ -1,8 +1,7 @@
-//! Forecasts the remaining life from the record, with the monitor's own filter (`health::Forecast`), and computes the
+//! Forecasts the remaining life from the record with the monitor's own filter (`health::Forecast`), and computes the
 //! fan that shows the forecast in the capacity chart.
 //!
 //! A store's rows and a replay's events both contain the filter's inputs, so both give the same result as the monitor.
-//! A record that lacks its beginning gives a wider interval.
 
 use std::collections::BTreeMap;
 
@@ -13,17 +12,16 @@ use crate::alarm::Rule;
 use crate::health::{Axis, CapacityReading, Forecast, InsufficientData, Remaining, RemainingLife, Usage};
 use crate::quantity::DAY_S;
 
-/// Number of points of a fan.
 const POINTS: usize = 60;
-/// Upper limits of the fan's length: [`MAX_MEDIANS`] times the median time to the end of life, and [`MAX_RECORDS`]
-/// times the length of the record (or the median, if it is larger).
+/// The fan is at most this many times as long as the median time to the end of life.
 const MAX_MEDIANS: f64 = 2.5;
+/// The fan is at most this many times as long as the record. It may always be as long as the median time to the end of
+/// life.
 const MAX_RECORDS: f64 = 2.0;
-/// The first limit is at least this multiple of the record's length. Even if the median is near, the end of life may
-/// come much later.
+/// The limit by [`MAX_MEDIANS`] is at least this multiple of the record's length, because the end of life may come much
+/// later than the median.
 const LEAST_RECORDS: f64 = 0.2;
 
-/// Forecast of the capacity at a time.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct DatedFanPoint {
     pub(super) time_s: f64,
@@ -33,28 +31,26 @@ pub(super) struct DatedFanPoint {
     pub(super) high_ah: f64,
 }
 
-/// Forecast of the cell whose life ends first, among the cells with a known life.
+/// Forecast for the cell whose life ends first, among the cells with a known remaining life.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Outlook {
-    /// Index of the cell, from 0.
     pub(super) cell: usize,
-    /// Points for the capacity chart; empty = the end has passed, or the rate of use is unknown.
+    /// Points for the capacity chart; empty = the end of life has passed, or the rate of use is unknown.
     pub(super) fan: Vec<DatedFanPoint>,
-    /// Capacity at the end of life (Ah).
     pub(super) end_ah: f64,
     pub(super) life: RemainingLife,
-    /// Reason why the life of other cells is unknown; one of them may end first.
+    /// Reason why the life of some cells is unknown. One of these cells may reach its end of life first.
     pub(super) unknown: Option<String>,
 }
 
-/// Capacity at the end of life (Ah) from the configuration. Without a configuration, it is the limit of the least
-/// severe capacity alarm in the record.
+/// Returns the capacity at the end of life (Ah) from the configuration. Without a configuration, it is the limit of the
+/// least severe capacity alarm in the record.
 pub(super) fn end_of_life_ah(data: &Data, context: &PageContext<'_>) -> Option<f64> {
     let configured = context.config.map(|config| config.monitor.health.end_of_life_ah);
     configured.or_else(|| threshold(data, context, Rule::CapacityLow))
 }
 
-/// Forecasts the cell whose life ends first, or returns the reason why the forecast is missing.
+/// Returns the forecast for the cell whose life ends first, or the reason why there is no forecast.
 pub(super) fn outlook(data: &Data, context: &PageContext<'_>) -> Result<Outlook, String> {
     let end_ah = end_of_life_ah(data, context)
         .ok_or("the record does not state the capacity at the end of life; a configuration (-c) does")?;
@@ -66,7 +62,7 @@ pub(super) fn outlook(data: &Data, context: &PageContext<'_>) -> Result<Outlook,
     let known = lives.into_iter().enumerate().filter_map(|(cell, life)| Some((cell, life.ok()?)));
     match known.min_by(|a, b| median(&a.1).total_cmp(&median(&b.1))) {
         Some((cell, life)) => {
-            // If the life of one cell is already over, no other cell can have a shorter one.
+            // If the life of one cell is over, no other life can be shorter.
             let unknown = unknown.filter(|_| !is_over(&life));
             Ok(Outlook { cell, fan: fan(data, &cells[cell], &life), end_ah, life, unknown })
         }
@@ -74,7 +70,6 @@ pub(super) fn outlook(data: &Data, context: &PageContext<'_>) -> Result<Outlook,
     }
 }
 
-/// Whether the end of life has certainly passed.
 fn is_over(life: &RemainingLife) -> bool {
     life.cycles.or(life.days).is_some_and(|left| left.high <= 0.0)
 }
@@ -87,10 +82,9 @@ fn unknown_lives(lives: &[Result<RemainingLife, InsufficientData>], cell: usize,
     format!("unknown for {unknown} of {} cells (cell {}: {})", lives.len(), cell + 1, why)
 }
 
-/// The forecast of every cell at the end of the record, with the same inputs as in `monitor::life`.
+/// Returns the forecast of every cell at the end of the record, from the same inputs as in `monitor::life`.
 pub(super) fn cells(data: &Data, context: &PageContext<'_>) -> Vec<Forecast> {
-    // Standard deviation of the current sensor's gain without a configuration: the default of
-    // `capacity.current_gain_std`.
+    // Without a configuration, the default of `capacity.current_gain_std` applies.
     let gain_std = context.config.map_or(0.005, |config| config.monitor.health.capacity.current_gain_std);
     let key = |time_s: f64, cell: usize| (time_s.to_bits(), cell);
     let learned: BTreeMap<_, &CapacityRecord> =
@@ -105,8 +99,7 @@ pub(super) fn cells(data: &Data, context: &PageContext<'_>) -> Vec<Forecast> {
         for half in halves {
             let rated_ah = rated_ah(half.cell);
             let usage = Usage::in_half_cycle(half.charge_ah, half.duration_s, since_before_s, rated_ah);
-            // A half-cycle without a capacity still counts as use, because a store omits capacities without new
-            // information.
+            // A store omits capacities without new information, so a half-cycle without a capacity still counts as use.
             let row = learned.get(&key(half.time_s, half.cell));
             cells[half.cell].update(usage, row.and_then(|row| reading(row, gain_std)));
         }
@@ -147,8 +140,8 @@ impl Outlook {
         is_over(&self.life)
     }
 
-    /// Returns for example "14 cycles". If the life of another cell is unknown, the result is "unknown", as in the
-    /// monitor, unless the end of life has passed.
+    /// Returns for example "14 cycles". As in the monitor, the result is "unknown" if the life of another cell is
+    /// unknown, unless this cell's life is over.
     pub(super) fn value(&self) -> String {
         match self.life.cycles {
             Some(left) if self.unknown.is_none() => median(left),
@@ -156,7 +149,6 @@ impl Outlook {
         }
     }
 
-    /// Explains the value, with interval and days.
     pub(super) fn note(&self, cells: usize) -> String {
         let cycles = self.life.cycles.map_or_else(String::new, interval);
         if let Some(why) = &self.unknown {
@@ -182,7 +174,6 @@ fn interval(left: Remaining) -> String {
     format!("{} to {} in nine of ten cases", digits(left.low), digits(left.high))
 }
 
-/// Formats with one decimal below ten, otherwise with none.
 fn digits(value: f64) -> String {
     if value < 9.95 { format!("{value:.1}") } else { format!("{value:.0}") }
 }
@@ -193,7 +184,8 @@ mod tests {
     use crate::report::Origin;
     use crate::report::data::HalfCycleRecord;
 
-    /// Half-cycles of three hours, one every six hours. In each half-cycle, each cell loses its own share of 2 Ah.
+    /// Creates half-cycles of three hours, one every six hours. In every half-cycle, each cell loses its own share of 2
+    /// Ah.
     fn worn(halves: u32, losses: &[f64]) -> Data {
         let mut data = Data::new(Origin::Store);
         for half in 0..halves {
@@ -244,8 +236,8 @@ mod tests {
         let outlook = outlook(&data, &PageContext::default()).expect("enough readings");
         assert_eq!((outlook.cell, outlook.end_ah), (1, 1.6));
         let left = outlook.life.cycles.expect("cycles");
-        // A capacity of 1.7 Ah that fades by 0.006 Ah per cycle reaches the end of life after 17 full cycles along a
-        // straight line. Typical cells last longer.
+        // A capacity of 1.7 Ah that falls linearly by 0.006 Ah per cycle reaches the end of life after 17 full cycles.
+        // Typical cells last longer.
         assert!(left.low < 17.0 && left.high > 17.0 && (8.5..25.0).contains(&left.median), "{left:?}");
         let (first, last) = (outlook.fan[0], outlook.fan[POINTS - 1]);
         assert_eq!(first.time_s, data.halves.last().map(|half| half.time_s).expect("halves"));

@@ -14,14 +14,13 @@ fn unit(name: &str) -> &'static str {
     rule(name).map_or("", |rule| rule.spec().unit.symbol())
 }
 
-/// Removes the sign of a formatted number that is zero.
 pub(super) fn without_minus_zero(digits: String) -> String {
     let is_zero = digits.bytes().all(|byte| matches!(byte, b'-' | b'+' | b'0' | b'.'));
     if is_zero { digits.trim_start_matches(['-', '+']).to_owned() } else { digits }
 }
 
-/// Formats a duration in the largest unit in which it is at least 2: `90 s`, `45.0 min`, `6.0 h`, `3 days`. A duration
-/// below 2 s is also in s.
+/// Formats a duration in the largest unit in which it is at least 2: `90 s`, `45.0 min`, `6.0 h`, `3 days`. Below 2 s,
+/// the unit is s.
 pub(super) fn length(seconds: f64) -> String {
     match seconds {
         s if s < 120.0 => format!("{s:.0} s"),
@@ -52,13 +51,12 @@ pub(super) fn alarm_text(row: &AlarmRecord, verb: &str) -> String {
     format!("{} {verb} {value}, limit {limit}{cell}", about(&row.rule))
 }
 
-/// The text with a capital first letter.
 pub(super) fn capitalised(text: &str) -> String {
     let mut rest = text.chars();
     rest.next().map_or_else(String::new, |first| first.to_uppercase().chain(rest).collect())
 }
 
-/// Formats a time as a date, or as the time since the start of an undated record.
+/// Formats a time as a date or, in an undated record, as the time since its start.
 pub(super) fn moment(data: &Data, time_s: f64) -> String {
     if data.is_dated() {
         format_utc(Timestamp::from_secs(time_s)).replace('T', " ").replace('Z', " UTC")

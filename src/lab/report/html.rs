@@ -11,21 +11,15 @@ use crate::chart::{Picture, Size, variables};
 use crate::config::Config;
 use crate::{cell_fault_pictures, pack_view};
 
-/// Maximum number of rows of a table.
 const MAX_ROWS: usize = 200;
 
-/// Section after which the alarms follow.
 const ALARMS_AFTER: &str = "temperature";
 
-/// A section of the page.
 struct Section {
     id: &'static str,
     title: &'static str,
-    /// Names of the section's pictures.
     pictures: &'static [&'static str],
-    /// How to read the pictures.
     note: &'static str,
-    /// Text for a section without pictures.
     none: fn(&Data) -> &'static str,
 }
 
@@ -101,7 +95,7 @@ const SECTIONS: [Section; 8] = [
     },
 ];
 
-/// Renders the page.
+/// Renders the page as HTML.
 pub fn page(data: &Data, context: &PageContext<'_>) -> String {
     let outlook = forecast::outlook(data, context);
     let summary = summary::of(data, context, &outlook);
@@ -157,7 +151,6 @@ fn heading(data: &Data, context: &PageContext<'_>) -> Markup {
         1 => "one cell".to_owned(),
         cells => format!("{cells} cells"),
     };
-    // The links are in the order of the sections on the page.
     let links = SECTIONS.iter().flat_map(|section| {
         let is_before = section.id == ALARMS_AFTER;
         let more = [("use", "Use"), ("alarms", "Alarms")].into_iter().filter(move |_| is_before);
@@ -174,7 +167,6 @@ fn heading(data: &Data, context: &PageContext<'_>) -> Markup {
     }
 }
 
-/// First and last time of the data, and the time between them.
 fn span(data: &Data) -> String {
     let Some((first_s, last_s)) = data.ends_s() else { return "there is no record".to_owned() };
     let long = format::length(last_s - first_s);
@@ -184,7 +176,6 @@ fn span(data: &Data) -> String {
     }
 }
 
-/// What is wrong, and what to do.
 fn verdict(summary: &summary::Summary) -> Markup {
     html! {
         section class={ "verdict " (summary.condition.class()) } aria-label="Summary" {
@@ -200,7 +191,6 @@ fn verdict(summary: &summary::Summary) -> Markup {
     }
 }
 
-/// What is known, what is not, and what would teach it.
 fn knowledge_of(knowledge: &Knowledge) -> Markup {
     html! {
         section {
@@ -256,12 +246,11 @@ fn section(section: &Section, data: &Data, pictures: &[(String, Picture)]) -> Ma
     }
 }
 
-/// A section without content: one line.
 fn empty(id: &str, title: &str, why: &str) -> Markup {
     html! { section { p.none id=(id) { b { (title) "." } " " (format::capitalised(why)) } } }
 }
 
-/// Explains a gap between the end of the estimate and the start of the fan.
+/// Explains the difference between the learned capacity and the start of the forecast fan.
 fn gap(data: &Data, outlook: &forecast::Outlook) -> &'static str {
     let last = data.learned.iter().rev().find(|row| row.cell == outlook.cell);
     match (last, outlook.fan.first()) {
@@ -272,10 +261,9 @@ fn gap(data: &Data, outlook: &forecast::Outlook) -> &'static str {
     }
 }
 
-/// Explains the forecast in the capacity chart.
 fn forecast_note(data: &Data, outlook: &Result<forecast::Outlook, String>) -> Markup {
     let note = match outlook {
-        // The beginning of the page says why.
+        // The beginning of the page states the reason.
         Err(_) => return html! {},
         Ok(outlook) if outlook.is_over() => "No forecast of the capacity: the end of life has passed.".to_owned(),
         Ok(outlook) if outlook.fan.is_empty() => "The forecast has no dates: the rate of use is unknown.".to_owned(),
@@ -297,7 +285,6 @@ fn fan_note(data: &Data, outlook: &forecast::Outlook) -> String {
     )
 }
 
-/// How the pack was used.
 fn use_of(context: &PageContext<'_>) -> Markup {
     let Some(record) = &context.use_record else {
         return empty("use", "Use", "unknown: the state of the pack is missing");
@@ -335,7 +322,7 @@ fn alarms(data: &Data, pictures: &[(String, Picture)]) -> Markup {
     }
 }
 
-/// A table of the first [`MAX_ROWS`] rows. If there are more rows, a note states their number.
+/// Renders the first [`MAX_ROWS`] of `count` rows, with a note if there are more.
 fn table(names: &[&str], rows: impl Iterator<Item = Vec<String>>, count: usize) -> Markup {
     html! {
         div.scroll {
@@ -354,7 +341,6 @@ fn table(names: &[&str], rows: impl Iterator<Item = Vec<String>>, count: usize) 
     }
 }
 
-/// What the differences between the cells cost the pack.
 fn cost(context: &PageContext<'_>, quiet: &[(&str, &str)]) -> Markup {
     let Some(imbalance) = &context.imbalance else { return html! {} };
     let titles: Vec<String> = quiet.iter().map(|(_, title)| title.to_lowercase()).collect();
@@ -412,7 +398,6 @@ fn estimator(data: &Data) -> Markup {
     pairs(&rows)
 }
 
-/// Formats a count with thousands separators.
 fn grouped(count: u64) -> String {
     let digits = count.to_string();
     let groups: Vec<&[u8]> = digits.as_bytes().rchunks(3).rev().collect();
@@ -447,7 +432,6 @@ fn origin(data: &Data, context: &PageContext<'_>) -> Markup {
     }
 }
 
-/// Rows for the cell model, the number of cells and the limits of a configuration.
 fn settings(config: &Config) -> Vec<(String, String)> {
     let model = &config.monitor.model;
     let capacity = format!("{} Ah (rated {} Ah)", model.capacity_ah, model.rated_capacity_ah);

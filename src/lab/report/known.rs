@@ -1,4 +1,5 @@
-//! Lists what is known about the battery, as named figures, and what is not known: why, and what would teach it.
+//! Lists the known values of the battery. For an unknown value, it lists the reason and the measurement that would
+//! determine this value.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -12,23 +13,21 @@ use super::series::{self, CellStep};
 use crate::cell::{ModelBands, advise};
 use crate::monitor::ModelState;
 
-/// What teaches the capacity with a measured cell model.
+/// Measurement that determines the capacity if the cell model was measured.
 const TEACHES_CAPACITY: &str =
     "A charge from below 20 % to full after an hour of rest, or a discharge over the same range.";
-/// Below this share of innovations within their 95 % interval, the intervals are too narrow.
+/// With a smaller share of innovations within their 95 % interval, the intervals are too narrow.
 const LEAST_COVERAGE: f64 = 0.8;
 
-/// A known figure.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Tile {
     pub(super) name: &'static str,
     pub(super) value: String,
     pub(super) note: String,
-    /// Untrusted cells on which the figure depends; `None` = all cells are trusted, or the figure is not an estimate.
+    /// Untrusted cells on which the value depends; `None` = all cells are trusted, or the value is not an estimate.
     pub(super) doubt: Option<String>,
 }
 
-/// Something that is not known.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Gap {
     pub(super) name: &'static str,
@@ -36,12 +35,10 @@ pub(super) struct Gap {
     pub(super) teaches: String,
 }
 
-/// Known figures and gaps.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub(super) struct Knowledge {
     pub(super) tiles: Vec<Tile>,
     pub(super) gaps: Vec<Gap>,
-    /// Number of cells whose capacity was measured.
     pub(super) measured_cells: usize,
 }
 
@@ -59,7 +56,7 @@ impl Knowledge {
             Ok(outlook) => known.tile("Remaining life", outlook.value(), outlook.note(data.cells())),
             Err(why) => known.gap("Remaining life", capitalised(why) + ".", "Measured capacities over months of use."),
         }
-        // A figure is the worst of all cells, and an untrusted cell may be the worst.
+        // Each value is that of the worst cell, which may be untrusted.
         let raised = raised(data);
         let doubt = doubt(data, &raised);
         known.tiles.iter_mut().for_each(|tile| tile.doubt.clone_from(&doubt));
@@ -129,7 +126,6 @@ impl Knowledge {
         }
     }
 
-    /// Losses of lithium and of both electrodes. Each loss is the largest of all cells.
     fn losses(&mut self, data: &Data) {
         let figure = |step: CellStep| format!("{:.0} \u{b1} {:.0} %", step.worst.0, step.worst.1);
         let [lithium, negative, positive] = [series::lithium_lost, series::negative_lost, series::positive_lost]
@@ -156,7 +152,7 @@ impl Knowledge {
         }
     }
 
-    /// The latest recharge period, normalised if known, with the first recharge period for comparison.
+    /// Adds the latest recharge period, normalised if known, with the first recharge period for comparison.
     fn recharge(&mut self, data: &Data, context: &PageContext<'_>) {
         let normalised = || data.recharges.iter().filter_map(|row| row.normalised_s.map(|(mean, _)| mean));
         let raw = || data.recharges.iter().filter_map(|row| row.raw_s);
@@ -183,7 +179,6 @@ impl Knowledge {
         );
     }
 
-    /// What the differences between the cells cost.
     fn imbalance(&mut self, context: &PageContext<'_>) {
         match &context.imbalance {
             Some(Ok(pack)) => self.tile(
@@ -205,7 +200,7 @@ impl Knowledge {
         }
     }
 
-    /// What the cell model and the estimator leave open.
+    /// Adds the faults that the cell model cannot show, and the measurement that would reduce its SOC error most.
     fn model(&mut self, data: &Data, context: &PageContext<'_>) {
         let sourced = context.model.as_ref();
         if context.diagnosis.is_some() && is_prior(context) {
@@ -232,13 +227,12 @@ impl Knowledge {
     }
 }
 
-/// Whether the cell model is made from the label alone.
 fn is_prior(context: &PageContext<'_>) -> bool {
     let state = context.model.as_ref().map(|sourced| sourced.source.state);
     matches!(state, Some(ModelState::Prior | ModelState::Unfit))
 }
 
-/// What teaches the cell model. LFP cells keep the label's model.
+/// The model of LFP cells cannot be learned in use.
 fn teaches_model(context: &PageContext<'_>) -> String {
     let in_use = " With a reading per second and rests of some minutes, packwatch may also learn it in use.";
     format!("A measured cell model (packwatch fit).{}", if is_learnable(context) { in_use } else { "" })
@@ -249,19 +243,17 @@ fn is_learnable(context: &PageContext<'_>) -> bool {
     !chemistry.is_some_and(|name| name.starts_with("lfp"))
 }
 
-/// What teaches the capacity with the present cell model.
 fn teaches_capacity(context: &PageContext<'_>) -> String {
     if is_prior(context) { teaches_by_label(context) } else { TEACHES_CAPACITY.to_owned() }
 }
 
-/// What teaches the capacity while the cell model is made from the label.
 fn teaches_by_label(context: &PageContext<'_>) -> String {
     let lfp = " An LFP cell must be nearly empty at one end and nearly full at the other.";
     let is_flat = !is_learnable(context);
     format!("A discharge and a charge of more than a quarter of the capacity.{}", if is_flat { lfp } else { "" })
 }
 
-/// Says which alarms were raised in the record, and how often. Alarms of several cells at the same time count once.
+/// States which alarms were raised in the record, and how often. Alarms of several cells in the same minute count once.
 fn raised_before(data: &Data) -> String {
     let mut times: BTreeMap<&str, BTreeSet<i64>> = BTreeMap::new();
     for row in data.alarms.iter().filter(|row| row.change == "raised") {
@@ -285,7 +277,6 @@ fn deviation(data: &Data, step: &CellStep) -> String {
     format!("\u{b1} {:.3}{}", step.worst.1, of_cell(data, step))
 }
 
-/// Remark for a cell whose capacity is the configured value minus the assumed fade.
 fn assumed(measured: &BTreeSet<usize>, step: &CellStep) -> &'static str {
     if measured.contains(&step.cell) { "" } else { "; assumed, not measured yet" }
 }

@@ -1,16 +1,14 @@
-//! Finds the limits of the alarms. The limits come from the configuration; without a configuration, they come from the
-//! alarms in the record.
+//! Finds the limits of the alarms in the configuration or, without a configuration, in the alarms of the record.
 
 use super::context::PageContext;
 use super::data::Data;
 use crate::alarm::{Rule, Severity};
 
-/// Returns the rule's threshold with the lowest severity.
 pub(super) fn threshold(data: &Data, context: &PageContext<'_>, rule: Rule) -> Option<f64> {
     thresholds(data, context, rule).first().map(|(value, _)| *value)
 }
 
-/// Every threshold of a rule with its severity, the lowest severity first.
+/// Returns the thresholds of a rule with their severities, the lowest severity first.
 pub(super) fn thresholds(data: &Data, context: &PageContext<'_>, rule: Rule) -> Vec<(f64, String)> {
     let mut all: Vec<(f64, String)> = match context.config {
         Some(config) => {
@@ -27,12 +25,11 @@ pub(super) fn thresholds(data: &Data, context: &PageContext<'_>, rule: Rule) -> 
     all
 }
 
-/// Rank of the severity with this name; 0 = the lowest severity, or an unknown name.
+/// Returns the rank of a severity; 0 = the lowest severity, or an unknown name.
 pub(super) fn rank(severity: &str) -> usize {
     Severity::ALL.iter().position(|known| known.name() == severity).unwrap_or(0)
 }
 
-/// Returns the rule with this name.
 pub(super) fn rule(name: &str) -> Option<Rule> {
     Rule::ALL.into_iter().find(|rule| rule.name() == name)
 }

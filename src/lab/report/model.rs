@@ -8,12 +8,11 @@ use crate::cell::model_bands::CURVE_C;
 use crate::cell::{Coverage, ModelBands, advise};
 use crate::config::cell_model::{KnownBy, SourcedModel, state_words};
 
-/// Number of steps of the SOC range.
 const SOC_STEPS: u32 = 20;
 /// SOC at which resistances are stated.
 const HALF: f64 = 0.5;
 
-/// Rows of name and value; empty = the model is unknown.
+/// Returns rows of name and value; empty = the model is unknown.
 pub(super) fn rows(data: &Data, context: &PageContext<'_>) -> Vec<(String, String)> {
     let Some(sourced) = &context.model else { return Vec::new() };
     let bands = ModelBands::new(&sourced.model);
@@ -42,7 +41,6 @@ pub(super) fn rows(data: &Data, context: &PageContext<'_>) -> Vec<(String, Strin
     rows.into_iter().map(|(name, value)| (name.to_owned(), value)).collect()
 }
 
-/// Changes of the model, the latest first: when, state, capacity, residuals, note.
 pub(super) fn changes(data: &Data) -> impl Iterator<Item = Vec<String>> {
     data.models.iter().rev().map(|change| {
         let ModelRecord { time_s, state, capacity_ah, residual_v, chemistry, is_taken_back } = change;
@@ -61,13 +59,12 @@ pub(super) fn changes(data: &Data) -> impl Iterator<Item = Vec<String>> {
     })
 }
 
-/// The measurements that would help most, as sentences; `None` = unknown.
+/// Returns the measurements that would reduce the SOC error most, as sentences; `None` = unknown.
 pub(super) fn advice(context: &PageContext<'_>) -> Option<Vec<String>> {
     let (_, advice) = advise(&ModelBands::new(&context.model.as_ref()?.model))?;
     Some(advice.iter().map(sentence).collect())
 }
 
-/// A measurement, and the error of the SOC that remains after it.
 pub(super) fn sentence(advice: &crate::cell::Advice) -> String {
     format!("{} (error then: {:.1} points)", advice.measurement, advice.left_points)
 }
@@ -105,7 +102,6 @@ fn seen(coverage: &Coverage) -> String {
     )
 }
 
-/// Formats ranges like "10 to 40 and 60 to 100 %".
 fn ranges(ranges: &[[f64; 2]], factor: f64, unit: &str) -> String {
     let words = ranges.iter().map(|[low, high]| format!("{:.0} to {:.0}", factor * low, factor * high));
     let words: Vec<String> = words.collect();

@@ -1,4 +1,4 @@
-//! Draws the report's pictures, each with the name of its file.
+//! Draws the report's pictures. Each picture comes with its file name.
 
 use std::path::Path;
 
@@ -16,11 +16,11 @@ use crate::chart::{
 };
 use crate::{cell_fault_pictures, model_pictures};
 
-/// Why a picture that needs samples is missing from a report of a store.
+/// Text in a store's report in place of a picture that needs samples.
 pub(super) const NOT_STORED: &str =
     "unknown: the history contains learned values but no samples; a report of a replay shows this picture";
 
-/// Writes every picture of the report into a folder, as SVG; returns the number of pictures.
+/// Writes every picture of the report into a folder as SVG. Returns the number of pictures.
 ///
 /// # Errors
 /// A file cannot be written.
@@ -30,7 +30,6 @@ pub fn write_plots(folder: &Path, data: &Data, context: &PageContext<'_>) -> Res
     Ok(pictures.len())
 }
 
-/// Returns every picture that has data, with the name of its file.
 pub(super) fn all(data: &Data, context: &PageContext<'_>) -> Vec<(String, Picture)> {
     let outlook = forecast::outlook(data, context);
     let named = |name: &str, picture: Option<Picture>| picture.map(|picture| (name.to_owned(), picture));
@@ -51,7 +50,6 @@ pub(super) fn all(data: &Data, context: &PageContext<'_>) -> Vec<(String, Pictur
     of_data.into_iter().flatten().chain(of_cells).chain(of_model).collect()
 }
 
-/// The x axis: dates, or time since the start in a suitable unit.
 struct TimeAxis {
     axis: Axis,
     zero_s: f64,
@@ -85,7 +83,6 @@ impl TimeAxis {
     }
 }
 
-/// A chart with title, description and axis labels.
 fn chart(title: impl Into<String>, about: &str, x: Axis, y: impl Into<Axis>, layers: Vec<Layer>) -> Option<Picture> {
     Some(Picture::Chart(Chart { description: about.to_owned(), ..Chart::new(title, x, y, layers) }))
 }
@@ -105,7 +102,6 @@ fn ink_of(severity: &str) -> Ink {
     }
 }
 
-/// Returns vertical lines at the times at which alarms of a rule were raised.
 fn raised(data: &Data, clock: &TimeAxis, rule: Rule) -> Option<Layer> {
     let rows = data.alarms.iter().filter(|row| row.rule == rule.name() && row.change == "raised");
     let points: Vec<Point> = rows
@@ -118,7 +114,6 @@ fn raised(data: &Data, clock: &TimeAxis, rule: Rule) -> Option<Layer> {
     (!points.is_empty()).then(|| Layer::new("alarm raised", Ink::Red, Shape::Moments(points)))
 }
 
-/// Lowest and highest value of each bin, as a band.
 fn range(
     bins: &[(f64, &TraceBin)],
     clock: &TimeAxis,
@@ -132,7 +127,7 @@ fn range(
     band.collect()
 }
 
-/// Returns the bins with data. A gap that must be visible keeps one empty bin, which interrupts the line.
+/// Returns the bins with data. A visible gap keeps one empty bin, which interrupts the line.
 fn filled<'a>(bins: impl Iterator<Item = (f64, &'a TraceBin)>) -> Vec<(f64, &'a TraceBin)> {
     let all: Vec<(f64, &TraceBin)> = bins.collect();
     let width_s = all.windows(2).map(|pair| pair[1].0 - pair[0].0).fold(f64::INFINITY, f64::min).max(1.0);
@@ -148,7 +143,6 @@ fn filled<'a>(bins: impl Iterator<Item = (f64, &'a TraceBin)>) -> Vec<(f64, &'a 
     wanted.collect()
 }
 
-/// Returns one line through the low and the high value of each bin.
 fn zigzag(band: &[(f64, f64, f64)]) -> Vec<(f64, f64)> {
     band.iter().flat_map(|(x, low, high)| [(*x, *low), (*x, *high)]).collect()
 }
@@ -166,7 +160,7 @@ fn soc(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
     chart(title, &description, clock.axis, Axis::number("SOC, %").within(-5.0, 105.0), layers)
 }
 
-/// The worst cell with its 95 % interval, and the range over the cells of a pack.
+/// Draws the worst cell with its 95 % interval, and the range over the cells of a pack.
 fn worst(data: &Data, clock: &TimeAxis, steps: &[CellStep], ink: Ink, name: &str) -> Vec<Layer> {
     let interval =
         steps.iter().map(|s| (clock.x(s.time_s), s.worst.0 - OF_95 * s.worst.1, s.worst.0 + OF_95 * s.worst.1));
@@ -182,7 +176,6 @@ fn worst(data: &Data, clock: &TimeAxis, steps: &[CellStep], ink: Ink, name: &str
 
 fn capacity(data: &Data, context: &PageContext<'_>, outlook: Option<&Outlook>) -> Option<Picture> {
     let steps = series::steps(data, series::capacity, false);
-    // Before the first measurement, the capacity is only assumed.
     let is_measured = data.learned.iter().any(|row| row.measured_ah.is_some());
     let (first_s, mut last_s) = data.ends_s().filter(|_| is_measured && !steps.is_empty())?;
     let fan = outlook.map_or(&[][..], |outlook| &outlook.fan);
@@ -210,7 +203,7 @@ fn capacity(data: &Data, context: &PageContext<'_>, outlook: Option<&Outlook>) -
     }
     let limits: Vec<Layer> = levels(data, context, Rule::CapacityLow).collect();
     let end = forecast::end_of_life_ah(data, context).map(Shape::Level);
-    // If a limit has the same value as the end of life, only the limit is drawn.
+    // If a limit equals the end of life, only the limit is drawn.
     let end = end.filter(|end| limits.iter().all(|limit| limit.shape != *end));
     layers.extend(end.map(|end| Layer::new("end of life", Ink::Grey, end)));
     layers.extend(limits);
@@ -220,8 +213,8 @@ fn capacity(data: &Data, context: &PageContext<'_>, outlook: Option<&Outlook>) -
     chart(title, description, clock.axis, within_reason(&steps, &layers, "capacity, Ah"), layers)
 }
 
-/// Returns an axis that covers the learned values with their intervals, the limits and the reference values. Capacities
-/// of single half-cycles can be far off and may lie outside.
+/// Returns an axis for the learned values with their intervals, the limits and the reference values. Capacities of
+/// single half-cycles may lie outside, because they scatter widely.
 fn within_reason(steps: &[CellStep], layers: &[Layer], label: &str) -> Axis {
     let mut low = steps.iter().map(|s| s.range.0.min(s.worst.0 - OF_95 * s.worst.1)).fold(f64::INFINITY, f64::min);
     let mut high = steps.iter().map(|s| s.range.1.max(s.worst.0 + OF_95 * s.worst.1)).fold(0.0, f64::max);
@@ -254,7 +247,7 @@ fn references(data: &Data, clock: &TimeAxis, context: &PageContext<'_>) -> Optio
     (!points.is_empty()).then(|| Layer::new(words, Ink::Plain, Shape::Points(points)))
 }
 
-/// The true SOC between two times: one line, or one line each for the lowest and the highest cell if they differ.
+/// Draws the true SOC: one line, or two lines if the lowest and the highest cell differ.
 fn true_soc(context: &PageContext<'_>, clock: &TimeAxis, (first_s, last_s): (f64, f64)) -> Vec<Layer> {
     let within = context.reference.socs.iter().filter(|row| row.0 >= first_s && row.0 <= last_s);
     let rows: Vec<(f64, f64, f64)> =

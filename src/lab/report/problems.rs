@@ -1,7 +1,7 @@
 //! Lists what is wrong with the battery, the worst first.
 //!
-//! The list is made from the findings about single cells, the raised alarms, the cost of the differences between the
-//! cells and the end of life. If a finding explains an alarm, both are one problem, so they cannot contradict each other.
+//! The list is made from the findings about single cells, the raised alarms, the charge lost by imbalance, and the end
+//! of life. If a finding explains an alarm, both are one problem, so that they cannot contradict each other.
 
 use std::collections::BTreeSet;
 
@@ -17,15 +17,15 @@ use crate::alarm::{Direction, Rule};
 use crate::cell_faults::{CellFault, CellFaultKind, Imbalance};
 use crate::quantity::{CellIndex, DAY_S};
 
-/// From this loss on, the pack counts as out of balance, fraction of its charge. Two standard deviations below the
-/// estimated loss must reach it.
+/// A pack is out of balance if imbalance makes at least this fraction of its charge unusable, even after subtracting
+/// two standard deviations.
 const OUT_OF_BALANCE: f64 = 0.03;
-/// A contact that is found within this part of the record counts as high from the beginning. Finding it takes days.
+/// A fault found within this share of the record counts as present from the beginning, because finding it takes days.
 const BEGINNING: f64 = 0.25;
 /// Time after which a contact that has not grown counts as steady (s).
 const STEADY_S: f64 = 7.0 * DAY_S;
 
-/// Kinds of findings about cells, in the order of the page. Other kinds follow; they are about sensors.
+/// Kinds of findings about cells, in the order of the page. Findings about sensors follow.
 const CELL_KINDS: [CellFaultKind; 8] = [
     CellFaultKind::Leak,
     CellFaultKind::LowCharge,
@@ -37,22 +37,17 @@ const CELL_KINDS: [CellFaultKind; 8] = [
     CellFaultKind::Module,
 ];
 
-/// Something that is wrong.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Problem {
     pub(super) condition: Condition,
-    /// What is wrong with which cell, as sentences.
     pub(super) what: String,
-    /// What to do, as sentences.
     pub(super) advice: String,
-    /// Alarms and dates, as sentences.
     pub(super) note: String,
-    /// Whether an alarm is raised about it.
     pub(super) is_alarm: bool,
 }
 
 impl Problem {
-    /// Adds alarms that this problem explains. The problem becomes at least as severe as the worst of them.
+    /// Adds alarms that this problem explains. The problem becomes at least as severe as the worst alarm.
     fn add_alarms(&mut self, alarms: &[&ActiveAlarm<'_>], data: &Data) {
         self.condition = alarms.iter().map(|alarm| condition_of(&alarm.row.severity)).fold(self.condition, Ord::max);
         self.note = format!("{}{}", self.note, alarm_notes(alarms, data)).trim_start().to_owned();
@@ -60,7 +55,6 @@ impl Problem {
     }
 }
 
-/// Returns all problems, the worst first.
 pub(super) fn problems(data: &Data, context: &PageContext<'_>, outlook: Option<&Outlook>) -> Vec<Problem> {
     let findings = context.diagnosis.map_or(&[][..], |diagnosis| diagnosis.findings());
     let mut problems = of_battery(findings, data, context, outlook);
@@ -71,12 +65,11 @@ pub(super) fn problems(data: &Data, context: &PageContext<'_>, outlook: Option<&
         note: String::new(),
         is_alarm: false,
     }));
-    // A stable sort: problems of the same condition keep their order, those with a raised alarm first.
+    // Problems of the same condition keep their order, except that those with a raised alarm come first.
     problems.sort_by_key(|problem| std::cmp::Reverse((problem.condition, problem.is_alarm)));
     problems
 }
 
-/// Problems that the findings and the data show, in the order of their sources.
 fn of_battery(
     findings: &[CellFault],
     data: &Data,
@@ -125,14 +118,13 @@ fn of_battery(
     problems
 }
 
-/// Whether the capacity is below the end of life, regardless of alarms.
 fn is_over(data: &Data, context: &PageContext<'_>, outlook: Option<&Outlook>) -> bool {
     let least = series::steps(data, series::capacity, false).last().map(|step| step.worst.0);
     let is_below = least.zip(forecast::end_of_life_ah(data, context)).is_some_and(|(least, end)| least < end);
     is_below || outlook.is_some_and(Outlook::is_over)
 }
 
-/// Groups findings by kind, and contacts also by growth. A pair of channels is its own group.
+/// Groups findings by kind, and contacts also by growth. A finding about a pair of channels is its own group.
 fn of_findings<'a>(findings: &'a [CellFault], data: &Data) -> Vec<Vec<&'a CellFault>> {
     let key = |found: &CellFault| (found.kind, Growth::of(found, data));
     let mut groups: Vec<Vec<&CellFault>> = Vec::new();
@@ -145,7 +137,7 @@ fn of_findings<'a>(findings: &'a [CellFault], data: &Data) -> Vec<Vec<&'a CellFa
     groups
 }
 
-/// Whether a finding is the reason of an alarm of this rule and cell.
+/// Whether a finding explains an alarm of this rule and cell.
 fn explains(found: &CellFault, rule: Rule, cell: Option<usize>) -> bool {
     let is_reason = match rule {
         Rule::CellLeak => found.kind == CellFaultKind::Leak,
@@ -157,7 +149,6 @@ fn explains(found: &CellFault, rule: Rule, cell: Option<usize>) -> bool {
     is_reason && cell.and_then(|cell| u16::try_from(cell).ok()).is_some_and(|cell| found.is_of(CellIndex(cell)))
 }
 
-/// The problem of one group of findings, with the alarms that they explain.
 fn finding(group: &[&CellFault], raised: &[ActiveAlarm<'_>], data: &Data) -> Problem {
     let kind = group[0].kind;
     let expanded = group.iter().filter_map(|found| found.cells).flat_map(|(first, last)| {
@@ -193,7 +184,7 @@ fn finding(group: &[&CellFault], raised: &[ActiveAlarm<'_>], data: &Data) -> Pro
     }
 }
 
-/// One sentence per rule, severity and date: since when which alarm is raised.
+/// Writes one sentence per rule, severity and day that states since when the alarm is raised.
 fn alarm_notes(alarms: &[&ActiveAlarm<'_>], data: &Data) -> String {
     let day = |since_s: f64| (since_s / DAY_S).floor();
     let mut notes: Vec<((&str, &str), f64, Vec<usize>)> = Vec::new();
@@ -213,7 +204,8 @@ fn alarm_notes(alarms: &[&ActiveAlarm<'_>], data: &Data) -> String {
     notes.into_iter().map(note).collect()
 }
 
-/// Smallest and largest size of the findings, in the unit of [`sentence`]. A single size has its standard deviation.
+/// Formats the sizes of the findings in the unit of [`sentence`]: a single size with its standard deviation, otherwise
+/// the smallest and the largest.
 fn sizes(group: &[&CellFault]) -> String {
     let (scale, digits) = match group[0].kind {
         CellFaultKind::Contact => (100.0, 0),
@@ -232,7 +224,7 @@ fn sizes(group: &[&CellFault]) -> String {
     }
 }
 
-/// Says what is wrong. `subject`: the cells. `size`: the size in the unit of the sentence.
+/// Describes a finding. `subject` names the cells, and `size` is in the unit of the sentence.
 fn sentence(kind: CellFaultKind, subject: &str, are_many: bool, size: &str) -> String {
     let has = if are_many { "have" } else { "has" };
     match kind {
@@ -267,7 +259,6 @@ fn lower(subject: &str) -> String {
     subject.to_lowercase()
 }
 
-/// How the resistance of a contact has changed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Growth {
     /// The resistance has grown, or was not high at the beginning.
@@ -287,7 +278,7 @@ impl Growth {
         let Some((first_s, last_s)) = data.ends_s() else { return Some(Self::Unknown) };
         let since_s = found.since.secs();
         let is_late = since_s - first_s > (BEGINNING * (last_s - first_s)).max(STEADY_S);
-        // Two standard deviations of the difference between the first reported size and the present one.
+        // The resistance has grown if it exceeds the first reported value by two standard deviations of the difference.
         let first = found.cells.and_then(|cells| data.first_sizes.get(&(found.kind, cells.0)));
         let has_grown = first.map(|first| found.size.mean - first.mean > 2.0 * found.size.std().hypot(first.std()));
         if is_late || has_grown == Some(true) {
@@ -309,7 +300,7 @@ impl Growth {
         }
     }
 
-    /// Advice; `None` = the advice of the finding applies.
+    /// Returns the advice; `None` = the advice of the finding applies.
     const fn advice(self) -> Option<&'static str> {
         match self {
             Self::Grows => None,
@@ -324,7 +315,6 @@ impl Growth {
     }
 }
 
-/// Loss by imbalance and its standard deviation, percent.
 fn percent(pack: &Imbalance) -> (f64, f64) {
     (100.0 * pack.lost_by_imbalance.mean, 100.0 * pack.lost_by_imbalance.std())
 }
@@ -333,7 +323,6 @@ fn is_unbalanced(pack: &Imbalance) -> bool {
     pack.lost_by_imbalance.mean - 2.0 * pack.lost_by_imbalance.std() >= OUT_OF_BALANCE
 }
 
-/// The problem of a pack that is out of balance although no single cell stands out.
 fn unbalanced(pack: &Imbalance, is_only: bool) -> Problem {
     let (mean, std) = percent(pack);
     let [empty, full] = [&pack.discharge_limit, &pack.charge_limit].map(|limit| limit.cell.index() + 1);
@@ -353,7 +342,6 @@ fn unbalanced(pack: &Imbalance, is_only: bool) -> Problem {
     }
 }
 
-/// The problem of raised alarms of one rule and severity.
 fn alarm(group: &AlarmGroup<'_>, data: &Data, context: &PageContext<'_>, outlook: Option<&Outlook>) -> Problem {
     let row = group.alarms[0].row;
     let rule = rule(&row.rule);
@@ -409,7 +397,7 @@ fn alarm_sentence(group: &AlarmGroup<'_>, data: &Data, context: &PageContext<'_>
     }
 }
 
-/// The evidence with which alarms of a thermal event were raised, in words.
+/// Describes the evidence on which the alarms of a thermal event were raised.
 fn evidence(group: &AlarmGroup<'_>) -> String {
     let values: Vec<f64> = group.alarms.iter().filter_map(|alarm| alarm.row.value).collect();
     let has = |kind: u8| values.iter().any(|value| *value as u8 & kind != 0);
@@ -421,7 +409,6 @@ fn condition_of(severity: &str) -> Condition {
     [Condition::Watch, Condition::Plan, Condition::Act][rank(severity).min(2)]
 }
 
-/// Whether a rule is about the measurement, not about the battery itself.
 const fn concerns_measurement(rule: Rule) -> bool {
     matches!(
         rule,

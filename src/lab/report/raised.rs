@@ -1,5 +1,4 @@
-//! Determines the state at the end of the record: raised alarms with their values, and cells whose estimate is
-//! untrusted.
+//! Determines which alarms are raised at the end of the record, with their values, and which cells are then untrusted.
 
 use std::collections::BTreeMap;
 
@@ -11,27 +10,24 @@ use super::series;
 use crate::alarm::Rule;
 use crate::health::RechargeAlarm;
 
-/// Maximum number of cells or ranges that a list names; further cells are only counted.
+/// Maximum number of cells or ranges in a list; more are only counted.
 const MAX_NAMED: usize = 8;
 
-/// An alarm that is raised at the end of the data.
 pub(super) struct ActiveAlarm<'a> {
-    /// The row that raised the alarm.
     pub(super) row: &'a AlarmRecord,
     pub(super) since_s: f64,
 }
 
-/// Raised alarms of one rule and severity.
 pub(super) struct AlarmGroup<'a> {
     pub(super) alarms: Vec<&'a ActiveAlarm<'a>>,
 }
 
-/// Alarms that are raised at the end, one per rule, severity and cell.
+/// Returns the alarms raised at the end: one per rule, severity and cell.
 pub(super) fn raised(data: &Data) -> Vec<ActiveAlarm<'_>> {
     let mut last: BTreeMap<(&str, &str, Option<usize>), ActiveAlarm<'_>> = BTreeMap::new();
     for row in &data.alarms {
         let key = (row.rule.as_str(), row.severity.as_str(), row.cell);
-        // Keep the row that raised the alarm: only this row certainly contains the value.
+        // Keep the row that raised the alarm, because only this row certainly contains the value.
         if row.is_active {
             last.entry(key).or_insert(ActiveAlarm { row, since_s: row.time_s });
         } else {
@@ -41,7 +37,6 @@ pub(super) fn raised(data: &Data) -> Vec<ActiveAlarm<'_>> {
     last.into_values().collect()
 }
 
-/// Groups alarms by rule and severity, the most severe first.
 pub(super) fn grouped<'a>(raised: &'a [ActiveAlarm<'a>]) -> Vec<AlarmGroup<'a>> {
     let mut groups: Vec<AlarmGroup<'a>> = Vec::new();
     for alarm in raised {
@@ -58,11 +53,10 @@ pub(super) fn grouped<'a>(raised: &'a [ActiveAlarm<'a>]) -> Vec<AlarmGroup<'a>> 
     groups
 }
 
-/// Formats cell numbers, counted from 1 and in ascending order: `cell 3`, `cells 1, 2 and 5`, `cells 1 to 96`,
-/// `cells 1, 3, 5, 7, 9, 11, 13, 15 and 88 more`, or `pack`.
+/// Formats cell numbers (from 1) of ascending indices: `cell 3`, `cells 1, 2 and 5`, `cells 1 to 96`, `cells 1, 3, 5,
+/// 7, 9, 11, 13, 15 and 88 more`, or `pack` without cells.
 pub(super) fn cells(cells: impl Iterator<Item = usize>) -> String {
     let numbers: Vec<usize> = cells.map(|cell| cell + 1).collect();
-    // Text and number of cells of each part.
     let parts_of = |run: &[usize]| match *run {
         [first, _, .., last] => vec![(format!("{first} to {last}"), run.len())],
         _ => run.iter().map(|number| (number.to_string(), 1)).collect(),
@@ -80,8 +74,7 @@ pub(super) fn cells(cells: impl Iterator<Item = usize>) -> String {
     }
 }
 
-/// Returns the value that the alarm's rule compares with the threshold, as known at the end of the record; `None` =
-/// unknown.
+/// Returns the value that the alarm's rule compares with the threshold at the end of the record; `None` = unknown.
 pub(super) fn value(
     row: &AlarmRecord,
     data: &Data,
@@ -110,7 +103,7 @@ pub(super) fn value(
     }
 }
 
-/// Untrusted cells as text; `None` = all estimates are trusted.
+/// Names the untrusted cells; `None` = all estimates are trusted.
 pub(super) fn doubt(data: &Data, raised: &[ActiveAlarm<'_>]) -> Option<String> {
     let alarms = raised.iter().filter(|alarm| rule(&alarm.row.rule) == Some(Rule::EstimateUntrusted));
     let mut doubtful: Vec<Option<usize>> = alarms.map(|alarm| alarm.row.cell).collect();

@@ -6,7 +6,7 @@ use std::path::Path;
 use crate::capacity_table::CapacityTable;
 use crate::io::table::TableError;
 
-/// Measured or true values; times in s on the clock of the data.
+/// Measured or true values. Times are in s on the clock of the data.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Reference {
     /// Time and capacity (Ah). If the rows name their cells, the capacity of the weakest cell applies.
@@ -17,11 +17,11 @@ pub struct Reference {
     pub socs: Vec<(f64, f64, f64)>,
 }
 
-/// Reads a [`CapacityTable`]. If the table has a column `cell`, consecutive rows with the same time are joined: the
-/// reference then has the capacity of the weakest cell, and the lowest and highest SOC.
+/// Reads a [`CapacityTable`]. If it has a column `cell`, consecutive rows with the same time are joined. The reference
+/// then has the capacity of the weakest cell, and the lowest and highest SOC.
 ///
 /// # Errors
-/// The file cannot be read, a column is missing, or a value is not a number or is out of range; the error names file
+/// The file cannot be read, a column is missing, or a value is not a number or is out of range. The error names file
 /// and line.
 pub fn read(path: &Path) -> Result<Reference, TableError> {
     let mut table = CapacityTable::open_reference(path)?;
@@ -50,13 +50,12 @@ pub fn read(path: &Path) -> Result<Reference, TableError> {
     Ok(reference)
 }
 
-/// Removes points at which the capacity hardly changes. If a capacity differs by at most 0.02 % from the capacity of
-/// the point that was kept before, its point is removed. The first and the last point always stay.
+/// Removes points whose capacity differs by at most 0.02 % from that of the previous kept point. The first and the last
+/// point always stay.
 fn thin(points: &mut Vec<(f64, f64)>) {
     let last = points.last().copied();
     let mut kept_ah = f64::INFINITY;
     points.retain(|(_, ah)| {
-        // The first point is always kept.
         let is_kept = (ah - kept_ah).abs() > 2e-4 * ah;
         kept_ah = if is_kept { *ah } else { kept_ah };
         is_kept

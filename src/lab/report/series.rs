@@ -3,11 +3,9 @@
 use super::data::{CapacityRecord, Data};
 use crate::filter::ends;
 
-/// State of the cells after a half-cycle.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct CellStep {
     pub(super) time_s: f64,
-    /// Index of the worst cell, from 0.
     pub(super) cell: usize,
     /// Mean and standard deviation of the worst cell.
     pub(super) worst: (f64, f64),
@@ -15,7 +13,7 @@ pub(super) struct CellStep {
     pub(super) range: (f64, f64),
 }
 
-/// Selects a value of a row, with mean and standard deviation.
+/// Selects a value of a row: mean and standard deviation.
 pub(super) type ValueSelector = fn(&CapacityRecord) -> Option<(f64, f64)>;
 
 pub(super) fn capacity(row: &CapacityRecord) -> Option<(f64, f64)> {
@@ -31,12 +29,10 @@ pub(super) fn lithium_lost(row: &CapacityRecord) -> Option<(f64, f64)> {
     row.losses.map(|losses| percent(losses[0]))
 }
 
-/// Active material of the negative electrode lost, percent.
 pub(super) fn negative_lost(row: &CapacityRecord) -> Option<(f64, f64)> {
     row.losses.map(|losses| percent(losses[1]))
 }
 
-/// Active material of the positive electrode lost, percent.
 pub(super) fn positive_lost(row: &CapacityRecord) -> Option<(f64, f64)> {
     row.losses.map(|losses| percent(losses[2]))
 }
@@ -50,7 +46,7 @@ pub(super) fn resistance(row: &CapacityRecord) -> Option<(f64, f64)> {
 }
 
 /// Returns the worst cell after every half-cycle: the cell with the lowest value, or with the highest if `high_is_bad`.
-/// A cell keeps its value until it gets a new one.
+/// A cell keeps its value until its next value is known.
 pub(super) fn steps(data: &Data, pick: ValueSelector, high_is_bad: bool) -> Vec<CellStep> {
     let mut cells: Vec<Option<(f64, f64)>> = vec![None; data.cells()];
     let mut steps = Vec::new();
@@ -70,7 +66,6 @@ pub(super) fn steps(data: &Data, pick: ValueSelector, high_is_bad: bool) -> Vec<
     steps
 }
 
-/// Returns the time of every half-cycle, with the lowest and highest mean temperature of the cells.
 pub(super) fn temperatures(data: &Data) -> Vec<(f64, f64, f64)> {
     let rows = data.halves.chunk_by(|a, b| a.time_s == b.time_s);
     rows.filter_map(|rows| {
@@ -80,8 +75,8 @@ pub(super) fn temperatures(data: &Data) -> Vec<(f64, f64, f64)> {
     .collect()
 }
 
-/// Returns the equivalent full cycles of the cell that was used most: charge moved divided by twice the rated capacity.
-/// If the rated capacity is unknown, the first learned capacity replaces it.
+/// Returns the equivalent full cycles of the most used cell: charge moved divided by twice the rated capacity. If the
+/// rated capacity is unknown, the first learned capacity replaces it.
 pub(super) fn full_cycles(data: &Data, rated_ah: Option<f64>) -> Option<f64> {
     let mut moved_ah = vec![0.0; data.cells()];
     data.halves.iter().for_each(|half| moved_ah[half.cell] += half.charge_ah.max(0.0));

@@ -1,5 +1,5 @@
-//! Creates the beginning of the page: what is wrong, and the condition that follows from it. If nothing is wrong, the
-//! beginning says how far this is known.
+//! Creates the beginning of the page: problems, and the condition that follows from them. If there is no problem, a
+//! single entry states how much is known.
 
 use super::context::PageContext;
 use super::data::Data;
@@ -18,7 +18,6 @@ pub(super) enum Condition {
 }
 
 impl Condition {
-    /// CSS class of the condition.
     pub(super) const fn class(self) -> &'static str {
         match self {
             Self::Good => "good",
@@ -29,7 +28,7 @@ impl Condition {
         }
     }
 
-    /// Sign that does not depend on colour.
+    /// Symbol of the condition, for readers who cannot distinguish the colours.
     pub(super) const fn sign(self) -> &'static str {
         match self {
             Self::Good => "\u{2713}",
@@ -41,16 +40,14 @@ impl Condition {
     }
 }
 
-/// Content of the beginning.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Summary {
     pub(super) condition: Condition,
-    /// What is wrong, the worst first. Never empty: without a problem, the only entry says so.
+    /// Problems, the worst first. Never empty: if nothing is wrong, a single entry says so.
     pub(super) problems: Vec<Problem>,
     pub(super) knowledge: Knowledge,
 }
 
-/// Creates the beginning of the page.
 pub(super) fn of(data: &Data, context: &PageContext<'_>, outlook: &Result<Outlook, String>) -> Summary {
     let knowledge = Knowledge::of(data, context, outlook);
     let mut problems = problems(data, context, outlook.as_ref().ok());
@@ -60,7 +57,7 @@ pub(super) fn of(data: &Data, context: &PageContext<'_>, outlook: &Result<Outloo
     Summary { condition: problems[0].condition, problems, knowledge }
 }
 
-/// Says that nothing is wrong, and how far this is known.
+/// Returns the entry for a battery without problems, which states how much is known.
 fn no_problem(data: &Data, context: &PageContext<'_>, knowledge: &Knowledge) -> Problem {
     let compared = context.imbalance.as_ref().and_then(|pack| pack.as_ref().ok()).map(|pack| pack.cells);
     let limits = if knows_limits(data, context) { " No alarm is raised." } else { "" };
@@ -105,7 +102,6 @@ fn no_problem(data: &Data, context: &PageContext<'_>, knowledge: &Knowledge) -> 
     }
 }
 
-/// Whether the record or a configuration defines limits.
 fn knows_limits(data: &Data, context: &PageContext<'_>) -> bool {
     context.config.is_some() || !data.alarms.is_empty()
 }

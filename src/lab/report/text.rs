@@ -1,22 +1,22 @@
-//! The beginning of the page as text, for the terminal.
+//! Formats the beginning of the page as text for the terminal.
 
 use super::context::PageContext;
 use super::data::Data;
 use super::{forecast, summary};
 
-/// What the page says first: what is wrong with the battery, what is known and what is not known.
+/// Content of the beginning of the page.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Verdict {
-    /// What is wrong, the worst first, with the advice. Without a problem, the only entry says so.
+    /// What is wrong, the worst first, with the advice. If nothing is wrong, a single entry says so.
     pub problems: Vec<String>,
     /// Known figures: name and value.
     pub known: Vec<(&'static str, String)>,
-    /// Unknown figures: name, and why.
+    /// Unknown figures: name and reason.
     pub unknown: Vec<(&'static str, String)>,
 }
 
 impl Verdict {
-    /// Judges the data like the page.
+    /// Evaluates the data in the same way as the page.
     pub fn of(data: &Data, context: &PageContext<'_>) -> Self {
         let summary = summary::of(data, context, &forecast::outlook(data, context));
         let known = summary.knowledge.tiles.into_iter().map(|tile| {

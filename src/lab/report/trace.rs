@@ -1,19 +1,15 @@
-//! Summarises the estimates of a replay in bins: SOC, temperature, and consistency of the estimator.
+//! Summarises the estimates of a replay in time bins: SOC, temperature, and consistency of the estimator.
 
 use super::bins::{Bin, Bins};
 use crate::cell::Coverage;
 use crate::monitor::Estimate;
 
-/// The estimates of all cells in a stretch of time.
 #[derive(Debug, Clone)]
 pub(super) struct TraceBin {
-    /// Lowest and highest SOC, fraction.
     pub(super) soc: (f64, f64),
-    /// Lowest and highest end of a 95 % interval.
+    /// Lowest and highest end of the cells' 95 % intervals, fraction.
     pub(super) soc_band: (f64, f64),
-    /// Lowest and highest temperature, degrees Celsius.
     pub(super) temperature_c: (f64, f64),
-    /// Lowest and highest innovation (V).
     pub(super) innovation_v: (f64, f64),
     pub(super) health: Consistency,
 }
@@ -79,23 +75,20 @@ impl Consistency {
         self.squares += other.squares;
     }
 
-    /// Returns the share of innovations within their own 95 % interval.
     pub(super) fn coverage(&self) -> Option<f64> {
         (self.count > 0).then(|| self.inside as f64 / self.count as f64)
     }
 
-    /// Returns the mean normalised innovation squared. The mean is 1 if the variance of the filter is right.
+    /// Returns the mean normalised innovation squared, which is 1 if the variance of the filter is right.
     pub(super) fn mean_nis(&self) -> Option<f64> {
         (self.count > 0).then(|| self.squares / self.count as f64)
     }
 }
 
-/// Binned estimates of a replay.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Trace {
     pub(super) life: Option<Bins<TraceBin>>,
     pub(super) cells: Vec<Consistency>,
-    /// SOC and temperatures of all estimates.
     pub(super) seen: Coverage,
 }
 
@@ -111,7 +104,6 @@ impl Trace {
         self.cells[cell].add(&Consistency::of(estimate));
     }
 
-    /// Returns the consistency of all cells over all time.
     pub(super) fn health(&self) -> Consistency {
         self.cells.iter().fold(Consistency::default(), |mut all, cell| {
             all.add(cell);

@@ -1,12 +1,12 @@
-//! Rows about the use of a pack: time and events beyond limits, C-rates, depth of discharge, fast charges, rest at a
-//! high state of charge.
+//! Creates the rows about the use of a pack: time and events beyond limits, C-rates, depth of discharge, fast charges,
+//! rest at a high state of charge.
 
 use super::format;
 use crate::health::UseRecord;
 use crate::health::use_record::LimitUse;
 
-/// Rows of the limits: name, time and number of events beyond the limit, time in which this was known, time in which
-/// the value was unknown, extreme value. A limit that was not configured has no numbers.
+/// Returns the rows of the limits: name, time beyond the limit, number of events, time with a known value, time with an
+/// unknown value, extreme value. A limit that was not configured has no numbers.
 pub(super) fn limits(record: &UseRecord) -> impl Iterator<Item = Vec<String>> {
     let UseRecord { temperature_c, voltage_v, current_a, .. } = record;
     let charge_a = current_a.lowest.map(|lowest_a| (-lowest_a).max(0.0));
@@ -32,7 +32,6 @@ pub(super) fn limits(record: &UseRecord) -> impl Iterator<Item = Vec<String>> {
     })
 }
 
-/// The other rows: name and value.
 pub(super) fn rows(record: &UseRecord) -> Vec<(String, String)> {
     let UseRecord { c_rate, half_cycles, rest, .. } = record;
     let times = |seconds: &[f64; 5]| {

@@ -1,18 +1,18 @@
-//! Computes baselines for comparison with forecasts: a straight line through the last points, and a least-squares
-//! double exponential.
+//! Computes baselines for comparison with forecasts of remaining life: a straight line through the last points, and a
+//! least-squares double exponential.
 //!
 //! Input: points of [use, capacity]. Output: the use at which the curve first falls below the threshold.
 
-/// Number of steps in which the curve is evaluated.
 const STEPS: u32 = 20_000;
-/// First step of the search, and the step below which the search ends.
+/// First step of the search, and the step below which the search ends. Exponents have the unit 1 / (use at the last
+/// point).
 const SEARCH: (f64, f64) = (0.5, 1e-4);
-/// Largest magnitude of an exponent. The unit of an exponent is e-folds over the use so far.
+/// Largest magnitude of an exponent, 1 / (use at the last point).
 const STEEPEST: f64 = 50.0;
 
 /// Returns where the least-squares line through the last points meets the threshold; `None` = the line does not fall.
 pub(super) fn straight(points: &[[f64; 2]], threshold: f64) -> Option<f64> {
-    // The line is fitted to the last 30 % of the points, but to at least five points.
+    // The line is fitted to the last 30 % of the points, but to at least five.
     let wanted = ((0.3 * points.len() as f64) as usize).max(5);
     let last = &points[points.len().saturating_sub(wanted)..];
     let count = last.len() as f64;
@@ -26,33 +26,34 @@ pub(super) fn straight(points: &[[f64; 2]], threshold: f64) -> Option<f64> {
     (slope < 0.0).then(|| used + (threshold - capacity) / slope)
 }
 
-/// Fits C = a e^(b t) + c e^(d t) and returns where C falls below the threshold. The exponents b and d are searched.
-/// For given exponents, the factors a and c follow from a linear fit.
+/// Fits C = a e^(b t) + c e^(d t) and returns the use at which C falls below the threshold. The exponents b and d are
+/// searched; the factors a and c follow from a linear fit.
 pub(super) fn double_exponential(points: &[[f64; 2]], threshold: f64) -> Option<f64> {
     let scale = points.last()?[0];
     if points.len() < 4 || scale <= 0.0 {
         return None;
     }
     let fit = |exponents: [f64; 2]| linear(points, scale, exponents);
-    // Starts of the search: pairs of exponents, in e-folds over the use so far. The best result of all starts counts.
+    // Pairs of exponents (b, d) at which searches start. The best result counts.
     let found =
         [[-0.1, 0.5], [-0.2, -2.0], [-0.05, 3.0], [-0.5, 0.05]].into_iter().filter_map(|start| search(start, &fit));
     let (_, [a, c], [b, d]) = found.min_by(|x, y| x.0.total_cmp(&y.0))?;
     let capacity = |used: f64| a * (b * used / scale).exp() + c * (d * used / scale).exp();
-    // The curve is evaluated from the use so far to 20 times the use so far.
+    // The curve is searched from 1 to 20 times the use so far.
     let step = 19.0 * scale / f64::from(STEPS);
     (0..=STEPS).map(|index| scale + step * f64::from(index)).find(|&used| capacity(used) < threshold)
 }
 
-/// A fit: sum of squared errors, factors `[a, c]`, exponents `[b, d]`.
+/// Sum of squared errors, factors `[a, c]`, exponents `[b, d]`.
 type ExponentialFit = (f64, [f64; 2], [f64; 2]);
 
-/// Pattern search: moves to the best neighbour and doubles the step. If no neighbour is better, halves the step.
+/// Runs a pattern search: moves to the best neighbour and doubles the step, or halves the step if no neighbour is
+/// better.
 fn search(start: [f64; 2], fit: &dyn Fn([f64; 2]) -> Option<ExponentialFit>) -> Option<ExponentialFit> {
     let neighbours: [[f64; 2]; 8] =
         [[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]];
     let (mut best, mut step) = (fit(start)?, SEARCH.0);
-    // Maximum number of iterations. A search that needs more iterations creeps along a flat valley.
+    // The limit of 400 iterations stops searches that move slowly along a flat valley.
     for _ in 0..400 {
         if step < SEARCH.1 {
             break;
@@ -66,7 +67,7 @@ fn search(start: [f64; 2], fit: &dyn Fn([f64; 2]) -> Option<ExponentialFit>) -> 
     Some(best)
 }
 
-/// The best factors for these exponents; `None` = the two exponentials cannot be separated.
+/// Returns the best factors for these exponents; `None` = the two exponentials cannot be separated.
 fn linear(points: &[[f64; 2]], scale: f64, exponents: [f64; 2]) -> Option<ExponentialFit> {
     let at = |used: f64| exponents.map(|exponent| (exponent * used / scale).exp());
     let (mut xx, mut xy, mut yy, mut xc, mut yc) = (0.0, 0.0, 0.0, 0.0, 0.0);
@@ -79,8 +80,7 @@ fn linear(points: &[[f64; 2]], scale: f64, exponents: [f64; 2]) -> Option<Expone
         yc += y * capacity;
     }
     let determinant = xx * yy - xy * xy;
-    // If the determinant is too small relative to its terms, both exponentials nearly coincide. The comparison also
-    // rejects NaN.
+    // If the determinant is this small, both exponentials nearly coincide. The comparison also rejects NaN.
     if !matches!(determinant.partial_cmp(&(1e-12 * xx * yy)), Some(std::cmp::Ordering::Greater)) {
         return None;
     }

@@ -1,11 +1,10 @@
-//! Writes forecasts as one JSON document that ends in a line feed.
+//! Writes forecasts of remaining useful life as one JSON document that ends in a line feed.
 
 use serde::Serialize;
 
 use super::{CurrentForecast, HistoryScore, ScoreTotal, total};
 use crate::error::LabError;
 
-/// Version of the JSON documents.
 const VERSION: u32 = 1;
 /// Quantiles of the interval.
 const INTERVAL: [f64; 2] = [0.05, 0.95];

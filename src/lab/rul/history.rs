@@ -1,8 +1,8 @@
 //! Reads capacity histories: a [`CapacityTable`] in order of time.
 //!
-//! With a column `type`, only discharges are readings, and each discharge counts as a full cycle. Without this column,
-//! the file does not contain the use, so days are counted. `duration_s` states how long the cell was in use from the
-//! time of a row; the remaining time to the next row counts as rest. Without `duration_s`, up to a day counts as use.
+//! If the file has a column `type`, only discharges are readings, and use is counted in full cycles, one per discharge.
+//! Otherwise, use is counted in days. `duration_s` states how long the cell was in use after the time of a row. The
+//! remaining time until the next row counts as rest. Without `duration_s`, up to one day per row counts as use.
 
 use std::path::Path;
 
@@ -11,7 +11,7 @@ use crate::health::{Axis, Usage};
 use crate::io::table::TableError;
 use crate::quantity::Timestamp;
 
-/// A reading.
+/// One capacity reading.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct MeasuredCapacity {
     /// Line of the file.
@@ -37,7 +37,6 @@ pub struct History {
     pub rows: Vec<MeasuredCapacity>,
 }
 
-/// Use over the lines read so far.
 #[derive(Default)]
 struct UseCounter {
     first: Option<Timestamp>,
@@ -46,7 +45,7 @@ struct UseCounter {
     /// Discharges before the first reading.
     before: f64,
     used_days: f64,
-    /// Days in use after a row that does not state them.
+    /// Days of use that are assumed after a row without `duration_s`.
     unstated_days: f64,
     rest_days: f64,
 }
@@ -66,12 +65,11 @@ impl History {
     /// Reads a file.
     ///
     /// # Errors
-    /// The file cannot be read, or a field is wrong. The error states file, line, column, what was found and
-    /// what is allowed.
+    /// The file cannot be read, or a field is wrong.
     pub fn read(path: &Path) -> Result<Self, TableError> {
         let mut table = CapacityTable::open_in_order(path)?;
         let axis = if table.header().find("type").is_some() { Axis::Cycles } else { Axis::Days };
-        // Without the column, a pause between cycles cannot be told from use: up to a day counts as use.
+        // Without `duration_s`, a pause looks the same as use, so up to one day per row counts as use.
         let unstated_days = if table.header().find("duration_s").is_some() { 0.0 } else { 1.0 };
         let (mut counter, mut rows) = (UseCounter { unstated_days, ..UseCounter::default() }, Vec::new());
         while let Some(row) = table.next_row()? {
@@ -90,7 +88,6 @@ impl History {
 }
 
 impl UseCounter {
-    /// Counts a line. Returns the line's reading, if it has one.
     fn add_row(&mut self, axis: Axis, row: &CapacityRow<'_>) -> Option<MeasuredCapacity> {
         self.pass(row.time);
         let capacity_ah = row.capacity_ah.filter(|_| row.is_discharge);
@@ -102,8 +99,7 @@ impl UseCounter {
         reading
     }
 
-    /// Adds the rest since the previous line: the time between the lines, minus the time in use that the previous line
-    /// states.
+    /// Adds the time since the previous line, minus the use after that line, to the rest.
     fn pass(&mut self, time: Timestamp) {
         if let Some(last) = self.last {
             self.rest_days += (time.since(last) / 86_400.0 - self.used_days).max(0.0);

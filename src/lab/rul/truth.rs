@@ -1,11 +1,10 @@
-//! Finds the end of a life: the use at which the isotonic (non-increasing least-squares) fit of the capacities falls
-//! below the threshold.
+//! Finds the end of a cell's life: the use at which the isotonic (non-increasing least-squares) fit of the capacities
+//! falls below the threshold.
 
 use super::History;
 
-/// Returns the use at which the fit falls below the threshold; `None` = the fit never falls below it, or is below it
-/// from the first reading. If the threshold lies between the capacities of the two readings, the use is interpolated
-/// between them. Otherwise, it is the use at the later reading.
+/// Returns the use at which the fit falls below the threshold; `None` = the fit never falls below the threshold, or
+/// starts below it. If the threshold lies between the capacities of the two readings, the use is interpolated.
 pub fn end_of_life(history: &History, threshold_ah: f64) -> Option<f64> {
     let capacities: Vec<f64> = history.rows.iter().map(|row| row.capacity_ah).collect();
     let line = non_increasing(&capacities);
@@ -18,8 +17,8 @@ pub fn end_of_life(history: &History, threshold_ah: f64) -> Option<f64> {
     Some(before.used + (after.used - before.used) * (before.capacity_ah - threshold_ah) / drop)
 }
 
-/// Returns the non-increasing sequence with the smallest sum of squared differences. Neighbours that rise are replaced
-/// by their mean.
+/// Returns the non-increasing sequence with the smallest sum of squared differences. Rising neighbours are replaced by
+/// their mean.
 fn non_increasing(values: &[f64]) -> Vec<f64> {
     let mut blocks: Vec<(f64, usize)> = Vec::with_capacity(values.len());
     for &value in values {

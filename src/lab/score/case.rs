@@ -16,19 +16,18 @@ use crate::measured::{MeasuredFile, MeasuredPart};
 use crate::monitor::{EventKind, MonitorConfig};
 use crate::quantity::Timestamp;
 
-/// Number of rows between two progress reports.
 const REPORT_EVERY: usize = 4096;
-/// If the initial SOC is outside 0 to 1 by at most this value, it is clamped. This can happen because a counter does
-/// not always start at exactly 0.
+/// An initial SOC is clamped if it is outside 0 to 1 by at most this value, because a counter does not always start at
+/// exactly 0.
 const SOC_SLACK: f64 = 0.005;
 
-/// Where in a file the estimator starts.
+/// Row of a file at which the estimator starts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Start {
-    /// At the first row with a true SOC, or at the first row of a file without an ampere-hour counter.
+    /// The first row with a true SOC. In a file without an ampere-hour counter, the first row.
     Full,
-    /// At the row where a given share of the charge has been taken out; earlier rows are dropped.
+    /// The row where a given share of the charge has been taken out. Earlier rows are dropped.
     Middle,
 }
 
@@ -37,20 +36,19 @@ pub enum Start {
 pub struct Case {
     /// Start of the estimator in the file.
     pub start: Start,
-    /// Error of the initial SOC (points); `None` = the estimator gets no initial SOC and starts from the
-    /// first voltage.
+    /// Error of the initial SOC (points); `None` = the estimator gets no initial SOC and starts from the first voltage.
     #[serde(rename = "told_points")]
     pub soc_error_points: Option<f64>,
     /// Error of the initial capacity, percent of the model's capacity.
     pub capacity_error_percent: f64,
-    /// Offset of the sensor: added to every measured current before the monitor sees it (A).
+    /// Offset of the current sensor (A), added to every measured current.
     pub current_offset_a: f64,
-    /// Seed of the random windows. The monitor sees only the rows in the windows; `None` = the monitor sees all rows.
+    /// Seed of the random windows. The monitor receives only the rows in the windows; `None` = it receives all rows.
     pub seed: Option<u64>,
 }
 
 impl Case {
-    /// Returns the case in words. The two given names are used for the errors of capacity and current.
+    /// Describes the case. The two given names are used for the errors of capacity and current.
     pub fn words(&self, separator: &str, [capacity, current]: [&str; 2]) -> String {
         let mut words = vec![match self.start {
             Start::Full => "full".to_owned(),
@@ -75,7 +73,7 @@ pub struct CaseScore {
     /// The case.
     #[serde(flatten)]
     pub case: Case,
-    /// What was read of the file.
+    /// Interpretation of the file's columns.
     #[serde(skip)]
     pub reading: TableReading,
     /// Rows fed to the monitor.
@@ -86,11 +84,11 @@ pub struct CaseScore {
     pub resets: usize,
     /// Estimated capacity at the end (Ah); `None` = no estimate.
     pub final_capacity_ah: Option<f64>,
-    /// Standard deviation of the capacity (Ah).
+    /// Standard deviation of `final_capacity_ah` (Ah).
     pub final_capacity_std_ah: Option<f64>,
-    /// Estimated resistance at the end relative to new; `None` = no estimate.
+    /// Estimated resistance at the end, relative to new; `None` = no estimate.
     pub final_resistance_ratio: Option<f64>,
-    /// Standard deviation of the resistance.
+    /// Standard deviation of `final_resistance_ratio`.
     pub final_resistance_ratio_std: Option<f64>,
     /// Score of the SOC; `None` = no row has both an estimate and a true SOC.
     pub soc: Option<SocScore>,
@@ -131,11 +129,10 @@ pub(super) fn run(
     run.finish(case, &file.reading)
 }
 
-/// First row of a case.
 struct CaseStart {
     part: usize,
     row: usize,
-    /// SOC at that row, fraction; NaN without a counter.
+    /// SOC at this row, fraction; NaN = no counter.
     truth: f64,
 }
 
@@ -177,12 +174,11 @@ impl CaseStart {
     }
 }
 
-/// SOC by the counter, fraction; NaN where the counter has no value.
+/// Returns the SOC according to the counter, fraction; NaN = the counter has no value.
 fn truth(part: &MeasuredPart, row: usize, settings: &ScoreSettings) -> f64 {
     1.0 - part.discharged_ah[row] / settings.truth_capacity_ah
 }
 
-/// Returns the monitor's configuration for the case.
 fn configure(job: &ScoreJob, case: &Case, settings: &ScoreSettings, truth: f64) -> Result<MonitorConfig, LabError> {
     let mut config = settings.monitor.clone();
     let estimator = &mut config.estimator;
@@ -207,7 +203,6 @@ fn configure(job: &ScoreJob, case: &Case, settings: &ScoreSettings, truth: f64) 
     Ok(config)
 }
 
-/// State of a run.
 struct CaseRun<'a> {
     job: &'a ScoreJob,
     settings: &'a ScoreSettings,
@@ -247,7 +242,7 @@ impl<'a> CaseRun<'a> {
         }
     }
 
-    /// Feeds the rows `seen` of a part; `report` receives the number of rows since its last call.
+    /// Feeds the rows `seen` of a part. `report` receives the number of rows since its last call.
     fn part(&mut self, part: &MeasuredPart, seen: Range<usize>, report: &mut dyn FnMut(usize)) {
         let Some(&first_s) = part.time_s.get(seen.start).filter(|_| !seen.is_empty()) else { return };
         let known = self.cycles.as_ref().and_then(|table| table.start(&part.key));

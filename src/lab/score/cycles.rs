@@ -9,20 +9,18 @@ use crate::io::table::TableError;
 use crate::measured::MeasuredPart;
 use crate::quantity::Timestamp;
 
-/// A discharge of the table.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Discharge {
-    /// Start of the discharge.
     pub(crate) start: Timestamp,
     /// Published capacity (Ah); `None` = the table does not state it.
     pub(crate) capacity_ah: Option<f64>,
 }
 
-/// Start of each part of a measured file, and published capacities of the discharges.
+/// Start of each part of a measured file, and the published capacities of the discharges.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CycleTable {
     starts: HashMap<String, Timestamp>,
-    /// Discharges in order of time. Discharge number n is the n-th entry, counted from 1.
+    /// Discharges in order of time. Their numbers count from 1.
     pub(crate) discharges: Vec<Discharge>,
 }
 
@@ -51,8 +49,8 @@ impl CycleTable {
         Ok(table)
     }
 
-    /// Limits each capacity to the charge drawn by the load until the cut-off voltage. Charge that the tester drew
-    /// afterwards at constant voltage is subtracted.
+    /// Limits each capacity to the charge drawn until the cut-off voltage. Charge that the tester drew afterwards at
+    /// constant voltage is subtracted.
     pub(super) fn at_load(&self, parts: &[MeasuredPart]) -> Self {
         let mut table = self.clone();
         for part in parts.iter().filter(|part| part.is_discharge()) {
@@ -65,12 +63,12 @@ impl CycleTable {
         table
     }
 
-    /// Returns the start of the part with this key; `None` = the table does not contain it.
+    /// Returns the start of the part with this key; `None` = it is not in the table.
     pub(super) fn start(&self, key: &str) -> Option<Timestamp> {
         self.starts.get(key).copied()
     }
 
-    /// Returns the number, from 1, of the latest discharge that has started at `time`; 0 = `time` is before the first.
+    /// Returns the number of the latest discharge that has started at `time`; 0 = none has started.
     pub(super) fn number_at(&self, time: Timestamp) -> usize {
         self.discharges.partition_point(|discharge| discharge.start <= time)
     }

@@ -1,4 +1,4 @@
-//! Feeds the rows of a measured file to the monitor: as frames on a bus, with the ticks of the driver between them.
+//! Feeds the rows of a measured file to the monitor as frames on a bus, with the ticks of the driver between them.
 
 use crate::can::decode::SensorIndex;
 use crate::filter::ScalarGaussian;
@@ -6,13 +6,13 @@ use crate::monitor::{Downtime, ModelState, MonitorConfig, Outputs, Snapshot};
 use crate::quantity::{CellIndex, Channel, Timestamp};
 use crate::replay::MonitorDriver;
 
-/// Assumed time between the latest row and a part whose start is unknown, ns.
+/// Assumed time between the latest row and a part whose start is unknown (ns).
 pub(super) const UNKNOWN_GAP_NS: i64 = 1_000_000_000;
 
-/// State of a monitor after the files from which it has learned.
+/// Learned state of a monitor.
 #[derive(Debug, Clone)]
 pub struct Learned {
-    /// The state.
+    /// Complete state of the monitor.
     pub snapshot: Snapshot,
     /// How well the cell's model is known.
     pub model: ModelState,
@@ -20,39 +20,35 @@ pub struct Learned {
     pub capacity: ScalarGaussian,
 }
 
-/// A monitor with the encoder and ticks of a replay.
 pub(super) struct Feeder(MonitorDriver);
 
 impl Feeder {
-    /// Creates a monitor that has received no row. The monitor starts in the learned state, if one is given.
+    /// Creates a monitor that has received no row, in the learned state if one is given.
     pub(super) fn new(config: MonitorConfig, sleep_gap_s: f64, learned: Option<&Learned>) -> Self {
         let mut driver = MonitorDriver::new(config, sleep_gap_s);
         if let Some(learned) = learned {
-            // The state was taken with the same configuration, except for the initial values.
+            // The state comes from the same configuration, except for the initial values, so it can be restored.
             let restored = driver.monitor.restore(learned.snapshot.clone(), Downtime::Unknown);
             debug_assert!(restored.is_ok(), "{restored:?}");
         }
         Self(driver)
     }
 
-    /// Returns the outputs since the caller last cleared them.
     pub(super) fn out(&mut self) -> &mut Outputs {
         &mut self.0.out
     }
 
-    /// Number of values that no frame can carry.
     pub(super) fn uncarried(&self) -> usize {
         self.0.uncarried_values
     }
 
-    /// State of the monitor.
     pub(super) fn learned(&self) -> Learned {
         let monitor = &self.0.monitor;
         let capacity = monitor.capacity(CellIndex(0));
         Learned { snapshot: monitor.snapshot(), model: monitor.model().state, capacity }
     }
 
-    /// Feeds one row: current (A) (positive = discharge), voltage (V) and temperature, degrees Celsius; NaN = no value.
+    /// Feeds one row: current (A, positive = discharge), voltage (V) and temperature (degrees Celsius); NaN = no value.
     pub(super) fn row(&mut self, time: Timestamp, current_a: f64, voltage_v: f64, temperature_c: f64) {
         let values = [
             (Channel::Current, Some(current_a)),

@@ -1,4 +1,4 @@
-//! Learns from measured files before a file is scored: runs them through the monitor, one after the other.
+//! Learns from measured files before a file is scored. The files run through the monitor one after the other.
 
 use std::path::PathBuf;
 
@@ -9,11 +9,11 @@ use crate::measured::MeasuredFile;
 use crate::monitor::MonitorConfig;
 use crate::quantity::Timestamp;
 
-/// Number of rows between two calls of `progress`: some milliseconds of work.
+/// Number of rows between two calls of `progress`. These rows take some milliseconds.
 const PROGRESS_ROWS: usize = 4096;
 
 /// Runs `files` through a monitor, with a gap of unknown length between parts and between files. `progress` is called
-/// for every file and at least every [`PROGRESS_ROWS`] rows; it may unwind to abort.
+/// for every file and at least every [`PROGRESS_ROWS`] rows. It may unwind to abort.
 ///
 /// # Errors
 /// A file cannot be read.

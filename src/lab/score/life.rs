@@ -1,4 +1,4 @@
-//! Scores the life of a cell: usable capacity after each discharge, compared with the published capacity.
+//! Scores the life of a cell: the usable capacity after each discharge is compared with the published capacity.
 
 use serde::Serialize;
 
@@ -15,19 +15,19 @@ use crate::quantity::catalogue::Quantity;
 pub struct DischargeScore {
     /// Number of the discharge, from 1.
     pub number: usize,
-    /// Published capacity down to the load's cut-off (Ah); `None` = not stated.
+    /// Published capacity down to the load's cut-off voltage (Ah); `None` = not stated.
     pub truth_ah: Option<f64>,
     /// Usable capacity at the configured load (Ah).
     pub usable_ah: f64,
     /// Standard deviation of the usable capacity (Ah).
     pub usable_std_ah: f64,
-    /// Capacity between the open-circuit voltages of full and empty (Ah).
+    /// Capacity between the full and the empty open-circuit voltage (Ah).
     pub capacity_ah: f64,
     /// Standard deviation of the capacity (Ah).
     pub capacity_std_ah: f64,
     /// Resistance relative to new.
     pub resistance_ratio: f64,
-    /// Standard deviation of the resistance.
+    /// Standard deviation of `resistance_ratio`.
     pub resistance_ratio_std: f64,
 }
 
@@ -38,13 +38,13 @@ pub struct LifeScore {
     pub discharges: usize,
     /// Number of discharges in the statistics.
     pub scored: usize,
-    /// Number of discharges, without those skipped, that have no estimate or no published capacity.
+    /// Number of unskipped discharges without an estimate or without a published capacity.
     pub left_out: usize,
-    /// Mean |estimate - published|, Ah.
+    /// Mean |estimate - published| (Ah).
     pub mean_abs_error_ah: f64,
     /// Mean (estimate - published) (Ah).
     pub mean_error_ah: f64,
-    /// Largest |estimate - published|, Ah.
+    /// Largest |estimate - published| (Ah).
     pub max_abs_error_ah: f64,
     /// Share of discharges whose 95 % interval contains the published value, fraction.
     pub coverage: f64,
@@ -52,9 +52,9 @@ pub struct LifeScore {
     pub mean_half_width_ah: f64,
     /// Threshold for `first_below_estimate` and `first_below_truth` (Ah).
     pub threshold_ah: f64,
-    /// First discharge (without those skipped) whose estimate is below the threshold.
+    /// First unskipped discharge whose estimate is below the threshold.
     pub first_below_estimate: Option<usize>,
-    /// First discharge (without those skipped) whose published capacity is below the threshold.
+    /// First unskipped discharge whose published capacity is below the threshold.
     pub first_below_truth: Option<usize>,
     /// Every discharge with an estimate.
     pub each: Vec<DischargeScore>,
@@ -63,7 +63,7 @@ pub struct LifeScore {
 /// Collects the estimates after each discharge from the monitor's events.
 #[derive(Debug, Default)]
 pub(super) struct LifeRecorder {
-    /// Mode of the latest half-cycle. The capacity event of this half-cycle follows.
+    /// Mode of the latest half-cycle, whose capacity event follows.
     mode: Option<Mode>,
     each: Vec<DischargeScore>,
 }
@@ -178,7 +178,7 @@ mod tests {
             life.observe(&half_cycle(time_s, Mode::Discharge), &table);
             life.observe(&capacity_event(time_s, usable_ah), &table);
             life.observe(&half_cycle(time_s + 1.0, Mode::Charge), &table);
-            life.observe(&capacity_event(time_s + 1.0, 7.0), &table); // must be ignored: follows a charge
+            life.observe(&capacity_event(time_s + 1.0, 7.0), &table); // ignored: follows a charge
         }
         let score = score(life.each, &table, 1.4, 1);
         assert_eq!((score.discharges, score.scored, score.left_out, score.each.len()), (5, 3, 1, 5));
@@ -186,7 +186,7 @@ mod tests {
         assert!((score.mean_abs_error_ah - 0.02).abs() < 1e-12 && (score.mean_error_ah + 0.04 / 3.0).abs() < 1e-12);
         assert!((score.max_abs_error_ah - 0.03).abs() < 1e-12 && (score.coverage - 1.0 / 3.0).abs() < 1e-12);
         assert!((score.mean_half_width_ah - 0.0196).abs() < 1e-12);
-        // Discharge 1 is below the threshold because of a wrong start, and is skipped.
+        // Discharge 1 is skipped, although its estimate is below the threshold.
         assert_eq!((score.first_below_estimate, score.first_below_truth), (Some(3), Some(4)));
     }
 }

@@ -8,10 +8,9 @@ use super::soc::SocSample;
 use crate::OF_95;
 use crate::chart::{self, Axis, Chart, Ink, Layer, Picture, PlotError};
 
-/// Words for the errors of capacity and current.
+/// Names of the errors of capacity and current.
 const WORDS: [&str; 2] = ["capacity", "current"];
 
-/// Draws the run and returns the path of the file.
 pub(super) fn draw(
     folder: &Path,
     name: &str,
@@ -33,7 +32,7 @@ pub(super) fn draw(
 }
 
 fn band(points: impl Iterator<Item = (f64, f64, f64)>) -> Layer {
-    // Converts (x, middle, half of the interval) to (x, lower, upper).
+    // Converts (x, middle, half-width) to (x, lower, upper).
     let points = points.map(|(x, middle, half)| (x, middle - half, middle + half));
     Layer::band("95 % interval", Ink::Orange, points)
 }
@@ -49,7 +48,7 @@ fn soc_panel(title: &str, samples: &[SocSample]) -> Chart {
 }
 
 fn error_panel(samples: &[SocSample]) -> Chart {
-    // Errors before settling would dwarf the rest, so the axis follows the second half of the run.
+    // Errors before settling are much larger, so the axis follows the second half of the run.
     let later = &samples[samples.len() / 2..];
     let reach = later.iter().map(|s| s.error_points().abs().max(s.half_width_points())).fold(1.0, f64::max) * 1.5;
     let inside = move |value: f64| value.clamp(-reach, reach);

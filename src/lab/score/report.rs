@@ -19,17 +19,15 @@ pub struct ScoreReport {
     pub settings: ScoreSettings,
     /// The cases.
     pub cases: Vec<Case>,
-    /// Every file in every case.
+    /// Scores of every file in every case.
     pub scores: Vec<CaseScore>,
 }
 
-/// Columns of the table of capacity errors.
 #[rustfmt::skip]
 fn life_heads(below: &str) -> [&str; 12] {
     ["file", "case", "mean |error|", "mean", "max", "in 95 %", "+/-", below, "truth", "capacity", "resistance", "resets"]
 }
 
-/// The JSON document.
 #[derive(Serialize)]
 struct Document<'a> {
     config: String,
@@ -52,7 +50,6 @@ struct LearnedDocument {
     capacity_std_ah: f64,
 }
 
-/// One case over all files.
 #[derive(Serialize)]
 struct Total<'a> {
     #[serde(flatten)]
@@ -106,7 +103,7 @@ impl ScoreReport {
         Ok(serde_json::to_string_pretty(&document)? + "\n")
     }
 
-    /// The scores as text tables.
+    /// Returns the scores as text tables.
     pub fn table(&self) -> String {
         let settings = &self.settings;
         let mut out = format!("cell model {}\n", settings.monitor.model.name);
@@ -161,7 +158,6 @@ impl ScoreReport {
         scored.map(|(score, life)| life_row(score, life)).collect()
     }
 
-    /// Adds notes on values that were not fed or not scored, and on plots.
     fn add_notes(&self, out: &mut String) {
         let mut note = |text: std::fmt::Arguments<'_>| {
             // Writing to a string cannot fail.
@@ -232,7 +228,6 @@ impl<'a> LifeTotal<'a> {
     }
 }
 
-/// Scores of the SOC, or scores of lives, with the names of their files.
 fn scored<'a, T>(scores: &[&'a CaseScore], of: impl Fn(&'a CaseScore) -> Option<&'a T>) -> Vec<(&'a str, &'a T)> {
     scores.iter().filter_map(|score| Some((score.name.as_str(), of(score)?))).collect()
 }
@@ -245,7 +240,6 @@ fn least<T>(all: &[(&str, &T)], value: impl Fn(&T) -> f64) -> f64 {
     all.iter().map(|(_, score)| value(score)).fold(f64::INFINITY, f64::min)
 }
 
-/// Returns the file with the largest value, and this value.
 fn worst<'a, T>(all: &[(&'a str, &T)], value: impl Fn(&T) -> f64) -> Option<(&'a str, f64)> {
     all.iter().map(|(name, score)| (*name, value(score))).max_by(|a, b| a.1.total_cmp(&b.1))
 }
@@ -293,7 +287,6 @@ fn life_row(score: &CaseScore, life: &LifeScore) -> Vec<String> {
     ]
 }
 
-/// Formats a finite value. Other values become a dash.
 fn known(value: f64, format: impl Fn(f64) -> String) -> String {
     if value.is_finite() { format(value) } else { "-".to_owned() }
 }

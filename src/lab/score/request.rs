@@ -1,8 +1,6 @@
-//! Defines the request for scores that the command line and the Python module use. Checks the request and runs it.
+//! Defines, checks and runs a request for scores from the command line or the Python module.
 //!
-//! Input: files, the configuration of the cell, starts of the estimator, settings of the statistics. Output:
-//! [`ScoreRun`], with the configuration and the tables read and checked. The measured files are read when they are
-//! scored. Errors name the file or the argument.
+//! The measured files are read when they are scored.
 
 use std::path::PathBuf;
 
@@ -14,26 +12,26 @@ use crate::io::csv_log::CsvOptions;
 use crate::io::paths::{check_distinct, short_names};
 use crate::single_cell::CellSource;
 
-/// What to score. Each file runs in every combination of starts, errors, offsets and seeds.
+/// A request. Each file runs in every combination of starts, errors, offsets and seeds.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ScoreRequest {
     /// Measured files.
     pub files: Vec<PathBuf>,
     /// Configuration of the cell.
     pub source: CellSource,
-    /// Files that the monitor has seen before, in order.
+    /// Files from which the monitor learns first, in order.
     pub learn: Vec<PathBuf>,
     /// Starts of the estimator in each file.
     pub start: Vec<Start>,
-    /// For a start in the middle of a file: the share of the full charge that has been taken out before the start.
+    /// For a start in the middle of a file: charge taken out before the start, as a share of the full charge.
     pub remove: f64,
     /// Errors of the initial SOC (points); `None` = no initial SOC.
     pub soc_error_points: Vec<Option<f64>>,
     /// Standard deviation of the initial SOC (points).
     pub soc_std_points: Option<f64>,
-    /// Errors of the initial capacity, percent of the model's capacity.
+    /// Errors of the initial capacity (percent of the model's capacity).
     pub capacity_error_percent: Vec<f64>,
-    /// Standard deviation of the initial capacity, percent.
+    /// Standard deviation of the initial capacity (percent).
     pub capacity_std_percent: Option<f64>,
     /// Offsets of the current sensor (A).
     pub current_offset_a: Vec<f64>,
@@ -41,20 +39,21 @@ pub struct ScoreRequest {
     pub settle_s: f64,
     /// Charge from full to empty that defines the true SOC (Ah); `None` = the model's capacity.
     pub truth_capacity_ah: Option<f64>,
-    /// Columns and sign of the files, if their headers do not say it.
+    /// Columns and current sign of the files, if their headers do not state them.
     pub table: CsvOptions,
-    /// If a gap between two rows is longer than this (s), the recorder counts as asleep.
+    /// A gap between two rows that is longer than this (s) means that the recorder was asleep.
     pub sleep_gap_s: f64,
-    /// Tables of published capacities, one per file; empty without tables.
+    /// Tables of published capacities, one per file; empty = no tables.
     pub cycles: Vec<PathBuf>,
-    /// Load at which the capacities were published: A, degrees Celsius (V); `None` = `[usable]` of the configuration.
+    /// Load at which the capacities were published: current (A), temperature (degrees Celsius), cut-off voltage (V).
+    /// `None` = `[usable]` of the configuration.
     pub load: Option<[f64; 3]>,
     /// Capacity threshold (Ah); the first discharge below it is reported.
     pub threshold_ah: f64,
     /// Number of discharges at the start of a life that are left out of the statistics.
     pub skip_cycles: usize,
-    /// Smallest and largest size of a window, as a share of the charge that a half-cycle moves. The monitor sees only
-    /// the rows in the windows; `None` = the monitor sees all rows.
+    /// Smallest and largest size of a window, as a share of the charge of a half-cycle. The monitor receives only the
+    /// rows in the windows; `None` = it receives all rows.
     pub window: Option<(f64, f64)>,
     /// Seeds of the windows.
     pub seeds: Vec<u64>,
@@ -63,7 +62,6 @@ pub struct ScoreRequest {
 }
 
 impl Default for ScoreRequest {
-    /// The defaults of the command line.
     fn default() -> Self {
         Self {
             files: vec![],
@@ -106,11 +104,11 @@ impl ScoreRun {
         &self.jobs
     }
 
-    /// Scores every file in every case; `progress` as in [`super::run`].
+    /// Scores every file in every case. `progress` is used as in [`super::run`].
     ///
     /// # Errors
-    /// The folder for the plots cannot be created, or a file cannot be scored. If several files cannot be scored,
-    /// the error of the first of them (in order) is returned.
+    /// The folder for the plots cannot be created, or a file cannot be scored. If several files cannot be scored, the
+    /// error of the first file (in order) is returned.
     pub fn run(self, progress: &(dyn Fn(usize, f64) + Sync)) -> Result<ScoreReport, LabError> {
         self.settings.plots.as_deref().map_or(Ok(()), create_folder)?;
         let scores: Vec<CaseScore> = super::run(&self.jobs, &self.cases, &self.settings, progress)?;
@@ -120,7 +118,7 @@ impl ScoreRun {
 }
 
 impl ScoreRequest {
-    /// Reads the configuration, the tables and the files to learn from; `progress` as in [`learn`].
+    /// Reads the configuration, the tables and the files to learn from. `progress` is used as in [`learn`].
     ///
     /// # Errors
     /// The configuration is faulty, a number is out of range, arguments are incompatible, or a table or a file to learn
@@ -167,7 +165,6 @@ impl ScoreRequest {
         Ok(())
     }
 
-    /// Checks the ranges of the arguments.
     fn check_numbers(&self) -> Result<(), LabError> {
         let above_0 = |value: f64| value > 0.0 && value.is_finite();
         let to_100 = |value: f64| value > 0.0 && value <= 100.0;

@@ -4,34 +4,27 @@ use serde::Serialize;
 
 use crate::OF_95;
 
-/// Largest error of a converged estimate (points) (percent of full).
+/// Largest error of a converged estimate (percentage points).
 pub const CONVERGED_POINTS: f64 = 2.0;
-/// The error must stay within [`CONVERGED_POINTS`] for this time (s). A wrong estimate that only crosses the truth has
+/// Time for which the error must stay within [`CONVERGED_POINTS`] (s). A wrong estimate that only crosses the truth has
 /// not converged.
 pub const CONVERGED_HOLD_S: f64 = 600.0;
 
-/// An estimate with its truth.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct SocSample {
-    /// Time since the start (s).
     pub(super) time_s: f64,
-    /// True SOC, fraction.
     pub(super) truth: f64,
-    /// Estimated SOC, fraction.
     pub(super) soc: f64,
-    /// Standard deviation of the estimated SOC, fraction.
     pub(super) soc_std: f64,
-    /// (Innovation / standard deviation) squared; NaN without an innovation.
+    /// (Innovation / standard deviation) squared; NaN = no innovation.
     pub(super) nis: f64,
 }
 
 impl SocSample {
-    /// Error of the estimate (points).
     pub(super) fn error_points(&self) -> f64 {
         100.0 * (self.soc - self.truth)
     }
 
-    /// Half of the 95 % interval (points).
     pub(super) fn half_width_points(&self) -> f64 {
         100.0 * OF_95 * self.soc_std
     }
@@ -51,9 +44,9 @@ pub struct SocScore {
     pub rmse_points: f64,
     /// Mean error (estimate - truth) (points).
     pub mean_error_points: f64,
-    /// Mean |error|, points.
+    /// Mean |error| (points).
     pub mean_abs_error_points: f64,
-    /// Largest |error|, points.
+    /// Largest |error| (points).
     pub max_abs_error_points: f64,
     /// Time after the start (s) from which |error| stayed within 2 points for 10 min; `None` = never.
     pub converge_s: Option<f64>,
@@ -61,18 +54,16 @@ pub struct SocScore {
     pub coverage: f64,
     /// Mean half-width of the interval (points).
     pub mean_half_width_points: f64,
-    /// Mean of (innovation / standard deviation) squared. If the filter's statistics are right, the mean is at most
-    /// about 1. At high sample rates, the mean is far below 1, because the filter counts information per second.
+    /// Mean of (innovation / standard deviation) squared. It is at most about 1 if the filter's statistics are right.
+    /// It is far below 1 at high sample rates, because the filter counts information per second.
     pub mean_normalised_innovation_squared: f64,
 }
 
-/// The mean; NaN without values.
 pub(super) fn mean(values: impl Iterator<Item = f64>) -> f64 {
     let (sum, count) = values.fold((0.0, 0_u64), |(sum, count), value| (sum + value, count + 1));
     sum / count as f64
 }
 
-/// The largest value; NaN without values.
 pub(super) fn largest(values: impl Iterator<Item = f64>) -> f64 {
     values.fold(f64::NAN, f64::max)
 }
@@ -97,8 +88,7 @@ pub(super) fn score(samples: &[SocSample], settle_s: f64, left_out_rows: usize) 
     }
 }
 
-/// Returns the start of the first period of at least [`CONVERGED_HOLD_S`] in which the error stays within
-/// [`CONVERGED_POINTS`].
+/// Returns the start of the first period of at least [`CONVERGED_HOLD_S`] with an error within [`CONVERGED_POINTS`].
 fn converged_at(samples: &[SocSample]) -> Option<f64> {
     let near = |sample: &SocSample| sample.error_points().abs() <= CONVERGED_POINTS;
     let stretches = samples.chunk_by(|a, b| near(a) == near(b)).filter(|stretch| near(&stretch[0]));
@@ -110,7 +100,7 @@ fn converged_at(samples: &[SocSample]) -> Option<f64> {
 mod tests {
     use super::*;
 
-    /// Samples every 10 s with these errors (points) and a standard deviation of 1 point.
+    /// Creates samples every 10 s with these errors (points) and a standard deviation of 1 point.
     fn samples(errors: &[f64]) -> Vec<SocSample> {
         let of = |(index, error): (usize, &f64)| SocSample {
             time_s: 10.0 * index as f64,
@@ -141,7 +131,7 @@ mod tests {
     #[test]
     fn converged_needs_a_held_small_error() {
         let mut errors = vec![-20.0; 5];
-        errors.extend([1.0; 10]); // crosses the truth, within the limit for 90 s
+        errors.extend([1.0; 10]); // within the limit for only 90 s
         errors.extend([5.0; 5]);
         errors.extend([1.9; 61]); // 600 s
         assert_eq!(score(&samples(&errors), 0.0, 0).converge_s, Some(200.0));

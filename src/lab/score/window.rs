@@ -1,9 +1,9 @@
-//! Selects random windows: the monitor sees only the rows in one window of each part of a file, as in a vehicle that
-//! starts and stops at any time. A part is usually a half-cycle.
+//! Selects random windows: the monitor receives only the rows in one window of each part of a file, as in a vehicle
+//! that starts and stops at any time. A part is usually a half-cycle.
 //!
-//! The window covers a share of the charge that the part moves (|current| times time). It does not cover a share of the
-//! time, because the long end of a charge, in which the charger reduces the current, would dominate. Share and position
-//! are uniformly distributed. Rows outside the window are dropped, so the monitor sees a gap.
+//! The window covers a share of the charge that the part moves (|current| times time). A share of the time would mostly
+//! cover the long end of a charge, in which the charger reduces the current. Share and position are uniformly
+//! distributed. Rows outside the window are dropped, so the monitor receives a gap.
 
 use std::ops::Range;
 
@@ -12,8 +12,8 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::measured::MeasuredPart;
 
-/// Returns the visible rows of part number `index`. At least one row is visible, unless the part is empty. If no
-/// current flows, the whole part is visible.
+/// Returns the rows in the window of part number `index`: at least one row, unless the part is empty. Without current,
+/// the window is the whole part.
 pub(super) fn rows(part: &MeasuredPart, index: usize, seed: u64, (least, most): (f64, f64)) -> Range<usize> {
     let moved = moved_as(part);
     let total = moved.last().copied().unwrap_or(0.0);
@@ -21,8 +21,7 @@ pub(super) fn rows(part: &MeasuredPart, index: usize, seed: u64, (least, most): 
         return 0..part.len();
     }
     let mut generator = ChaCha8Rng::seed_from_u64(seed);
-    // Each part has its own random stream, so the window of a part depends only on the seed and on the number of the
-    // part.
+    // Each part has its own random stream, so its window depends only on the seed and on its number.
     generator.set_stream(index as u64);
     let share = least + (most - least) * uniform(&mut generator);
     let begin = (1.0 - share) * uniform(&mut generator);
@@ -31,7 +30,7 @@ pub(super) fn rows(part: &MeasuredPart, index: usize, seed: u64, (least, most): 
     first..end.max(first + 1)
 }
 
-/// Returns the charge moved up to each row (A) s; both directions are added.
+/// Returns the charge moved up to each row (As), both directions added.
 fn moved_as(part: &MeasuredPart) -> Vec<f64> {
     let mut total = 0.0;
     let mut before_s = part.time_s.first().copied().unwrap_or(0.0);
@@ -45,7 +44,6 @@ fn moved_as(part: &MeasuredPart) -> Vec<f64> {
     part.time_s.iter().zip(&part.current_a).map(&mut step).collect()
 }
 
-/// Returns a random number in [0, 1), uniformly distributed.
 fn uniform(generator: &mut ChaCha8Rng) -> f64 {
     let unit = 1.0 / (1_u64 << 53) as f64;
     (generator.next_u64() >> 11) as f64 * unit
@@ -55,7 +53,7 @@ fn uniform(generator: &mut ChaCha8Rng) -> f64 {
 mod tests {
     use super::*;
 
-    /// 1000 s at 2 A, then 1000 s of rest.
+    /// Creates 1000 s at 2 A, then 1000 s of rest.
     fn part() -> MeasuredPart {
         let time_s: Vec<f64> = (0..=2000).map(f64::from).collect();
         let current_a = time_s.iter().map(|&t| if t <= 1000.0 { 2.0 } else { 0.0 }).collect();

@@ -71,7 +71,6 @@ impl Journal {
         self.counts.unanswered += requests;
     }
 
-    /// Logs the counts.
     pub(crate) fn summarise(&self) {
         let Counts { connections, batches, skipped, withheld, rejected, unanswered } = self.counts;
         tracing::info!(

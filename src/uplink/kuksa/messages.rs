@@ -153,7 +153,6 @@ pub(crate) struct GetProviderValueResponse {
     pub(crate) entries: BTreeMap<i32, Datapoint>,
 }
 
-/// A message to the broker.
 #[derive(Clone, PartialEq, prost::Message)]
 pub(crate) struct ToBroker {
     #[prost(oneof = "Action", tags = "2, 4, 6")]
@@ -226,7 +225,6 @@ pub(crate) struct Client {
 }
 
 impl Client {
-    /// Creates a client that sends `authorization` with every call.
     pub(crate) fn new(channel: Channel, authorization: Option<MetadataValue<Ascii>>) -> Self {
         Self { grpc: Grpc::new(channel), authorization }
     }

@@ -78,7 +78,6 @@ impl Outbox {
     }
 }
 
-/// The message stream of the connection.
 #[derive(Debug)]
 pub(crate) struct Messages {
     /// A message that is sent before all others: first the initial claim, later the empty claim after each batch.

@@ -15,7 +15,6 @@ use super::messages::{Datapoint, Metadata, ProvideSignalRequest, SampleInterval,
 use super::signals::{self, Signal};
 use super::value::{Limits, limit, type_name};
 
-/// The route of one signal.
 #[derive(Debug)]
 struct Route {
     signal: &'static Signal,
@@ -26,7 +25,6 @@ struct Route {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct SkippedSignal {
     pub(crate) path: String,
-    /// Why it is skipped.
     pub(crate) reason: String,
 }
 
@@ -38,15 +36,14 @@ pub(crate) struct DataPoints {
     pub(crate) withheld: Vec<&'static str>,
 }
 
-/// The routes of one connection.
 #[derive(Debug)]
 pub(crate) struct Routes {
     by_id: BTreeMap<i32, Route>,
 }
 
 impl Routes {
-    /// Searches the broker's metadata for every signal. The overlay's signals are below `branch`. `is_from_new`: whether
-    /// sums over the life of the battery are known.
+    /// Searches the broker's metadata for every signal. The overlay's signals are below `branch`. `is_from_new` states
+    /// whether sums over the life of the battery are known.
     pub(crate) fn resolve(metadata: &[Metadata], branch: &str, is_from_new: bool) -> (Self, Vec<SkippedSignal>) {
         let mut uses: HashMap<i32, usize> = HashMap::new();
         let mut by_path: HashMap<&str, &Metadata> = HashMap::new();
@@ -71,7 +68,6 @@ impl Routes {
         (Self { by_id }, skipped)
     }
 
-    /// Number of signals.
     pub(crate) fn len(&self) -> usize {
         self.by_id.len()
     }

@@ -36,7 +36,6 @@ const FAREWELL: Duration = Duration::from_millis(500);
 /// If the broker confirms no batch for this time, the connection is closed, because readers would mistake old values
 /// for current ones.
 const UNREAD_LIMIT: Duration = Duration::from_secs(30);
-/// Key of the certificates' file, for messages.
 const CA_FILE: &str = "kuksa.ca_file";
 /// Key of the token's file, for messages.
 const TOKEN_FILE: &str = "kuksa.token_file";

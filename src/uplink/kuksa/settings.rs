@@ -25,7 +25,7 @@ pub struct KuksaSettings {
     pub token_file: Option<PathBuf>,
     /// Branch of the overlay's signals.
     pub branch: String,
-    /// Whether the daemon has run with the battery since it was new, so that its sums are those of the battery's life.
+    /// Whether the daemon has run since the battery was new, so that the daemon's sums cover the battery's whole life.
     pub recorded_from_new: bool,
 }
 

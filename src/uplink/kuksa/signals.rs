@@ -30,7 +30,6 @@ pub(crate) enum Origin {
     Overlay,
 }
 
-/// A signal.
 #[derive(Debug)]
 pub(crate) struct Signal {
     /// Path below the branch.
@@ -105,7 +104,6 @@ pub(crate) fn all() -> impl Iterator<Item = &'static Signal> {
     SIGNALS.iter()
 }
 
-/// The signals of the overlay.
 pub(crate) fn of_overlay() -> impl Iterator<Item = &'static Signal> {
     all().filter(|signal| signal.origin == Origin::Overlay)
 }
@@ -117,7 +115,7 @@ fn signals_of(row: &'static QuantityRow, it: &'static Presentation, is_pack: boo
     let sign = if row.unit == Unit::Amperes { ", positive = into the battery" } else { "" };
     row.parts().map(move |(part, key)| {
         let (origin, name) = path(it.vss, part);
-        // The times of VSS itself are whole seconds.
+        // Times of standard VSS signals are whole seconds.
         let is_whole = origin == Origin::Standard && row.unit == Unit::Seconds;
         let about = match part {
             Part::Mean => format!("{}{sign}", it.about),

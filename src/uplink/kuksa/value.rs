@@ -5,7 +5,6 @@
 
 use super::messages::{Flags, Floats, Texts, TypedValue};
 
-/// A VSS datatype.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum DataType {
     Text,
@@ -35,7 +34,6 @@ impl DataType {
         }
     }
 
-    /// Number in the protocol.
     pub(crate) const fn code(self) -> i32 {
         match self {
             Self::Text => 1,
@@ -91,7 +89,6 @@ pub(crate) enum Value {
 }
 
 impl Value {
-    /// The datatype of this value.
     pub(crate) const fn data_type(&self) -> DataType {
         match self {
             Self::Text(_) => DataType::Text,

@@ -28,15 +28,14 @@ const LATEST_PROOF: Duration = Duration::from_millis(800);
 /// Maximum number of waiting requests. The broker sends one request at a time.
 const MAX_REQUESTS: usize = 8;
 
-/// A request and its time of arrival.
 pub(crate) type ValueRequest = (Instant, GetProviderValueRequest);
 
-/// The requests of one connection.
 #[derive(Debug, Default)]
 pub(crate) struct ValueRequests {
     waiting: Vec<ValueRequest>,
-    /// Number of the latest batch that was created. `read` is the number of the latest batch that the broker has read.
+    /// Number of the latest batch that was created.
     made: u32,
+    /// Number of the latest batch that the broker has read.
     read: u32,
     /// Arrival of the latest answered request; `None` = no answer waits for a proof.
     unproved: Option<Instant>,
@@ -44,7 +43,6 @@ pub(crate) struct ValueRequests {
 }
 
 impl ValueRequests {
-    /// Notes that a batch was made.
     pub(crate) fn note_batch(&mut self, number: u32) {
         self.made = number;
     }

@@ -42,7 +42,6 @@ pub fn messages(settings: &MqttSettings, document: &StatusDocument) -> Vec<Messa
     pack.chain(alarms).chain([device.event()]).chain(cells).chain(uplink).collect()
 }
 
-/// Adds unit, device class and state class of a kind of value.
 fn describe(config: &mut Value, kind: Kind) {
     match kind {
         Kind::Measured { unit, class, decimals } => {

@@ -51,7 +51,6 @@ pub struct Entity {
     source: Source,
 }
 
-/// Source of an entity's value.
 enum Source {
     Document(fn(&StatusDocument) -> Value),
     Catalogue(Quantity, Part),

@@ -39,12 +39,9 @@ const QUEUE_RETRY: Duration = Duration::from_secs(5);
 /// Longest time for the last messages before disconnecting.
 const FAREWELL: Duration = Duration::from_secs(2);
 
-/// Why a message was not published.
 #[derive(Debug, Clone, PartialEq, Eq)]
 enum Fault {
-    /// The broker rejected the message.
     Refused(String),
-    /// The connection failed.
     Lost(String),
 }
 
@@ -159,7 +156,7 @@ impl Link<'_> {
             tokio::select! {
                 _ = rhythm.tick() => {}
                 changed = documents.wait_for(|document| document.is_some() != is_online) => {
-                    // The sender outlives the link.
+                    // An error cannot occur, because the sender outlives the link.
                     changed.map_err(|error| error.to_string())?;
                 }
             }
@@ -239,9 +236,9 @@ struct PublishedState {
 }
 
 impl PublishedState {
-    /// Returns the messages to send now, in this order: the values, whether the daemon is online, the fill of the
-    /// queue, whether this program is online, and the discovery messages if the entities have changed. With this order,
-    /// no reader mistakes values of an earlier connection for current values.
+    /// Returns the messages to send now: the values, whether the daemon is online, the fill of the queue, whether this
+    /// program is online, and the discovery messages if the entities have changed. Because of this order, no reader
+    /// mistakes values of an earlier connection for current values.
     fn news(&mut self, settings: &MqttSettings, document: Option<&StatusDocument>, fill: Fill) -> Vec<Message> {
         let retained = |name: &str, text: String| Message::retained(settings.topic(name), text);
         let mut news = Vec::new();

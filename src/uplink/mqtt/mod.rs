@@ -1,6 +1,6 @@
-//! `packwatch mqtt`: sends the daemon's status to an MQTT broker and Home Assistant, with a queue for a lost link.
+//! `packwatch mqtt`: sends the daemon's status to an MQTT broker and Home Assistant, with a queue for times without a connection.
 //!
-//! | module | what lives there |
+//! | module | content |
 //! | --- | --- |
 //! | `settings` | the table `[mqtt]` |
 //! | `entity` | the table of entities |
@@ -11,7 +11,7 @@
 //! | `connect` | one connection |
 //! | `link` | publishing and forwarding |
 //!
-//! The recorder and the link share one thread and the queue. The recorder never waits for the link.
+//! The recorder and the link share one thread and the queue. The recorder does not wait for the link.
 
 pub mod connect;
 pub mod discovery;

@@ -19,7 +19,6 @@ use super::settings::HistorySettings;
 
 const FILE: &str = "queue.db";
 const LOCK: &str = "queue.lock";
-/// Layout version of the file.
 const VERSION: i64 = 1;
 /// Class of the missed events in the table `dropped`.
 const MISSED: i64 = 2;
@@ -111,9 +110,9 @@ impl Queue {
         self.added.notified()
     }
 
-    /// Adds messages. In the same transaction, stores `seen`, if given: the recorder's text about the events it has
-    /// already handled, and the number of events missed since the previous text. [`Self::seen`] returns the text, also
-    /// after a restart. When this function returns, the messages and `seen` are on disk.
+    /// Adds messages. If `seen` is given, stores it in the same transaction. `seen` is the recorder's text about the
+    /// events it has handled, and the number of events missed since the previous text. [`Self::seen`] returns the text,
+    /// even after a restart. When this function returns, everything is on disk.
     ///
     /// # Errors
     /// Fails if the disk fails or is full.
@@ -215,7 +214,6 @@ fn length(body: &str) -> u64 {
     body.len() as u64
 }
 
-/// Why the file cannot be opened.
 enum OpenFault {
     /// The file is not a valid queue.
     Damaged(String),

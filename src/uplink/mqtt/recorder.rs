@@ -1,11 +1,13 @@
-//! Implements the recorder, which selects the documents to queue as samples, and the new events.
+//! Selects which documents are queued as samples, and which of their events are new.
 //!
 //! Input: the daemon's documents. Output: messages in the [`Queue`], even if the broker cannot be reached. The daemon's
-//! clock decides when a sample is due. Each document lists the latest events, and the daemon numbers its events from its
-//! start. From the numbers the recorder finds the new events, and how many new events the document no longer lists,
-//! also across its own restart. These events are missed: they are counted, logged, and queued as one event
-//! `events_missed` in their place. A restart of the daemon is queued as an event `daemon_restarted`, because events that
-//! the previous run reported after its last received document are unknown.
+//! clock decides when a sample is due.
+//!
+//! Each document lists the latest events, and the daemon numbers its events from its start. From these numbers, the
+//! recorder finds the new events, even after its own restart. New events that the document no longer lists are missed.
+//! They are counted, logged, and queued as one event `events_missed` in their place. A restart of the daemon is queued
+//! as an event `daemon_restarted`, because events that the previous run reported after its last received document are
+//! unknown.
 
 use std::cell::Cell;
 
@@ -36,7 +38,7 @@ pub struct Recorder<'a> {
     period_s: u64,
     due: Option<Timestamp>,
     handled: Option<Handled>,
-    /// Whether the queue's note of the handled events is of another version.
+    /// Whether another version wrote the queue's record of handled events.
     has_other_note: bool,
     is_numbered: bool,
     works: Cell<bool>,
@@ -98,7 +100,7 @@ impl<'a> Recorder<'a> {
     }
 
     /// The events to queue, and the number of missed events. On the very first document, only the listed events are
-    /// new, because the uplink has missed nothing before it existed.
+    /// new, because events before the first start of the uplink do not count as missed.
     fn new_events(&mut self, document: &StatusDocument) -> (Vec<Value>, u64) {
         let (total, listed) = (document.event_count, document.events.len() as u64);
         if total < listed {

@@ -10,7 +10,7 @@ use serde::{Deserialize, Deserializer, de};
 
 use crate::files::read_credential;
 
-/// Longest base topic, bytes. MQTT allows 65,535 bytes, so every suffix fits.
+/// Longest base topic, bytes. MQTT allows 65,535 bytes for the base and its suffix.
 const MAX_TOPIC_BYTES: usize = 200;
 
 /// Key of the password's file, for messages.
@@ -48,7 +48,7 @@ pub struct MqttSettings {
     pub tls: Option<TlsSettings>,
     /// Discovery by Home Assistant.
     pub discovery: DiscoverySettings,
-    /// Queue for a lost link.
+    /// Queue for messages while there is no connection.
     pub history: HistorySettings,
 }
 
@@ -80,7 +80,7 @@ pub struct DiscoverySettings {
     pub device_name: Option<String>,
 }
 
-/// Queue for a lost link.
+/// Queue for messages while there is no connection.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct HistorySettings {

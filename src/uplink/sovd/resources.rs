@@ -1,7 +1,7 @@
-//! The resources of the component `battery`: path and status document to JSON.
+//! Converts a path and a status document to a resource of the component `battery`, as JSON.
 //!
-//! Data have the units of the status document. `null` = unknown. Faults are the alarms that need attention and the
-//! findings; cells count from 1.
+//! Data have the units of the status document. `null` = unknown. Faults are the findings, and the alarms that need
+//! attention. Cells count from 1.
 
 use packwatch_host::alarm::{Alarm, AlarmState, Severity};
 use packwatch_host::cell_faults::CellFault;
@@ -13,7 +13,7 @@ use serde_json::{Value, json};
 use crate::mqtt::entity::{stamp, word};
 
 const COMPONENT: &str = "/v1/components/battery";
-/// Query of the list of faults: only those with this state.
+/// Query parameter that selects the faults with one state.
 const FILTER: &str = "status[aggregatedStatus]";
 
 /// A request that cannot be answered, as SOVD's generic error.
@@ -41,7 +41,7 @@ impl Fault {
         Self::new(StatusCode::NOT_FOUND, "not-found", message)
     }
 
-    /// The body of the answer. SOVD has an own error code only for a component that does not respond.
+    /// The body of the answer. SOVD defines an error code only for a component that does not respond.
     pub(super) fn body(&self) -> Value {
         let Self { status, code, message } = self;
         if *status == StatusCode::SERVICE_UNAVAILABLE {
@@ -51,7 +51,7 @@ impl Fault {
     }
 }
 
-/// Returns the resource at `path`. `document`: `None` = the daemon is silent.
+/// Returns the resource at `path`. `document` is `None` if the daemon is silent.
 pub(super) fn get(path: &str, query: &str, document: Option<&StatusDocument>) -> Result<Value, Fault> {
     let path = path.strip_suffix('/').unwrap_or(path);
     let present = || {
@@ -90,7 +90,6 @@ fn unknown_query(query: &str) -> Fault {
     Fault::new(StatusCode::BAD_REQUEST, "unknown-query", format!("query {query}: must be {FILTER}=active on faults"))
 }
 
-/// An item of data.
 struct Item {
     id: String,
     name: String,
@@ -153,7 +152,7 @@ impl Item {
     }
 }
 
-/// The list of faults. `x-` keys show what the list cannot contain, so that a short list does not look healthy.
+/// The list of faults. `x-` keys state what the list cannot contain, so that a short list does not look healthy.
 fn fault_list(query: &str, document: &StatusDocument) -> Result<Value, Fault> {
     let decoded = query.replace("%5B", "[").replace("%5b", "[").replace("%5D", "]").replace("%5d", "]");
     let state = match decoded.split_once('=') {

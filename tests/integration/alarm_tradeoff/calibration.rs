@@ -1,15 +1,15 @@
-//! Compares the uncertainty that the Monitor states with the truth: stated probabilities with observed frequencies, and
-//! stated standard deviations with capacity errors.
+//! Compares the Monitor's stated uncertainty with the truth: stated probabilities with observed frequencies, and stated
+//! standard deviations with capacity errors.
 
 use super::Fleet;
 use super::life::{Evaluation, Life, RATED_AH, THRESHOLD};
 
 /// Bin edges of the stated probability.
 pub(crate) const EDGES: [f64; 9] = [0.0, 0.01, 0.05, 0.2, 0.5, 0.8, 0.95, 0.99, 1.0];
-/// Number of half-cycles skipped at the start of a life, because the initial capacity still affects the estimate.
+/// Half-cycles skipped at the start of a life because the initial capacity still affects the estimate.
 const SETTLING: usize = 10;
 
-/// Probability that the true capacity is below the threshold, computed as the alarm rule does.
+/// Probability that the true capacity is below the threshold, with the alarm rule's formula.
 pub(crate) fn stated(evaluation: &Evaluation) -> f64 {
     0.5 * libm::erfc((evaluation.mean_ah - THRESHOLD * RATED_AH) / (evaluation.std_ah * std::f64::consts::SQRT_2))
 }
@@ -37,17 +37,16 @@ pub(crate) fn bins(fleet: &Fleet) -> Vec<(usize, f64, f64)> {
     EDGES.windows(2).map(bin).collect()
 }
 
-/// Capacity errors of the ageing cells and their stated standard deviation. The evaluations that `evaluations` skips
-/// do not count.
+/// Capacity errors of the ageing cells. Only measured half-cycles after the first `SETTLING` count.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Errors {
-    /// In percent of the rated capacity: mean error, standard deviation of the lives' mean errors, standard deviation
-    /// of the error within a life, stated standard deviation.
+    /// All in percent of the rated capacity: mean error, standard deviation of the lives' mean errors, standard
+    /// deviation of the error within a life, and stated standard deviation.
     pub(crate) mean: f64,
     pub(crate) between_lives: f64,
     pub(crate) within_life: f64,
     pub(crate) stated: f64,
-    /// Shares of evaluations within the stated 68 and 95 % intervals.
+    /// Fractions of evaluations within the stated 68 % and 95 % intervals.
     pub(crate) inside_68: f64,
     pub(crate) inside_95: f64,
 }
@@ -56,7 +55,6 @@ fn mean(values: impl Iterator<Item = f64> + Clone) -> f64 {
     values.clone().sum::<f64>() / values.count() as f64
 }
 
-/// Capacity errors of a fleet's ageing lives.
 pub(crate) fn errors(fleet: &Fleet) -> Errors {
     let percent = |evaluation: &Evaluation| 100.0 * (evaluation.mean_ah - evaluation.true_ah) / RATED_AH;
     let sigmas = |evaluation: &Evaluation| (evaluation.mean_ah - evaluation.true_ah).abs() / evaluation.std_ah;

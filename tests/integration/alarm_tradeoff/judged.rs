@@ -1,12 +1,11 @@
-//! Judges one alarm rule on one life: when the alarm was raised, how long before the end of life, and whether the true
-//! capacity was below the threshold at that time.
+//! Applies one alarm rule to one life.
 
 use packwatch::alarm::{AlarmEngine, Change, Comparison, Observation, Rule, RuleConfig, Severity};
 use packwatch::quantity::CellIndex;
 
 use super::life::{Evaluation, Life, RATED_AH, THRESHOLD};
 
-/// Hysteresis relative to the threshold (the default): the alarm clears at 1.02 times the threshold.
+/// The default hysteresis, relative to the threshold.
 const HYSTERESIS: f64 = 0.02;
 
 /// A rule to compare.
@@ -21,7 +20,7 @@ const fn candidate(name: &'static str, when: Comparison, debounce_events: u32) -
     Candidate { name, when, debounce_events }
 }
 
-/// The rules to compare. The Monitor itself also runs the rules in `MONITORED`, each as a different severity.
+/// The rules to compare. The Monitor itself also runs the rules in `MONITORED`.
 pub(crate) const CANDIDATES: [Candidate; 8] = [
     candidate("p = 0.05", Comparison::Probability(0.05), 1),
     candidate("p = 0.2", Comparison::Probability(0.2), 1),
@@ -33,7 +32,7 @@ pub(crate) const CANDIDATES: [Candidate; 8] = [
     candidate("p = 0.99", Comparison::Probability(0.99), 1),
 ];
 
-/// The candidates that the study's configuration gives to the Monitor as info, warning and severe.
+/// Indices of the candidates that the Monitor runs with the severities info, warning and severe.
 pub(crate) const MONITORED: [usize; 3] = [0, 3, 6];
 pub(crate) const HALF: usize = 2;
 pub(crate) const MEAN: usize = 3;
@@ -44,8 +43,8 @@ pub(crate) const P95: usize = 6;
 pub(crate) struct RuleOutcome {
     /// The evaluation at which the alarm was first raised.
     pub(crate) first: Option<Evaluation>,
-    /// Number of raises while the true capacity was above the threshold. `far_false_raises` counts only the raises with
-    /// the true capacity above the threshold by more than 1 % of the rated capacity.
+    /// Number of raises while the true capacity was above the threshold. `far_false_raises` counts only those above by
+    /// more than 1 % of the rated capacity.
     pub(crate) false_raises: u32,
     pub(crate) far_false_raises: u32,
     /// Number of times that the alarm cleared before the end of life.
@@ -89,7 +88,6 @@ pub(crate) fn changes(rule: &Candidate, life: &Life) -> Vec<Option<Change>> {
     life.evaluations.iter().map(&mut observe).collect()
 }
 
-/// Judges a life by a rule.
 pub(crate) fn judge(rule: &Candidate, life: &Life) -> RuleOutcome {
     let mut judged = RuleOutcome::default();
     for (evaluation, change) in life.evaluations.iter().zip(changes(rule, life)) {

@@ -1,7 +1,6 @@
 //! Simulates one life: an ageing cell, its usage, its sensors, a slightly wrong model, and a Monitor.
 //!
-//! Records the Monitor's capacity estimate and the true capacity after each half-cycle, and the Monitor's own alarms.
-//! The same life (cell, usage, model errors) is simulated with every sensor set. Only the size of the sensor errors
+//! With every sensor set, the same life (cell, usage, model errors) is simulated. Only the size of the sensor errors
 //! differs.
 
 use std::path::Path;
@@ -24,26 +23,24 @@ pub(crate) const END_OF_LIFE: f64 = 0.70;
 
 /// Interval between two readings (s).
 const SAMPLE_S: f64 = 10.0;
-/// Time between the last reading under one load and the first reading under the next load (s). The time is short, so
-/// that the charge counted from a reading belongs to the load of that reading.
+/// Time between the last reading under one load and the first reading under the next load (s). It is short, so that the
+/// charge counted from a reading belongs to the load of that reading.
 const SWITCH_S: f64 = 0.1;
-/// Ticks per reading. After 5 s without a tick the Monitor assumes that the computer was suspended.
+/// Ticks per reading. After 5 s without a tick, the Monitor assumes that the computer was suspended.
 const TICKS: u32 = 4;
-/// The simulation of an ageing cell ends after this many half-cycles, counted from the start of the cycle in which the
-/// cell reaches its end of life.
+/// Number of half-cycles simulated from the start of the cycle in which an ageing cell reaches its end of life.
 const AFTERLIFE: u32 = 4;
 /// A constant-voltage charge ends at this current (A).
 const TAPER_END_A: f64 = RATED_AH / 10.0;
-/// Average charge moved per cycle, relative to the rated capacity. Converts cycles into ampere-hours.
+/// Average charge moved per cycle, relative to the rated capacity.
 const MOVED_PER_CYCLE: f64 = 2.0 * 0.55 * 0.85;
 
-/// Number of each random stream of a life.
 const CELL: u64 = 0;
 const USAGE: u64 = 1;
 const SENSORS: u64 = 2;
 
-/// Accuracy of a sensor set. Offsets and gains are standard deviations over the lives; each life keeps its own offset
-/// and gain. Noise is white, per reading.
+/// Accuracy of a sensor set. Offsets and gains are standard deviations over the lives; they are constant within a life.
+/// The noise is white.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct SensorSet {
     pub(crate) name: &'static str,
@@ -93,7 +90,6 @@ pub(crate) const SENSOR_SETS: [SensorSet; 3] = [
     },
 ];
 
-/// Kind of life.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Kind {
     /// Fades below the threshold and reaches the end of life.
@@ -102,18 +98,18 @@ pub(crate) enum Kind {
     Healthy,
 }
 
-/// The Monitor's estimate and the truth after one half-cycle.
+/// The Monitor's estimate and the true capacity after one half-cycle.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Evaluation {
     pub(crate) time: Timestamp,
     /// Cycles since the start of the life (two half-cycles make a cycle).
     pub(crate) cycle: f64,
-    /// Equivalent full cycles since the start: charge moved divided by twice the rated capacity.
+    /// Moved charge divided by twice the rated capacity.
     pub(crate) full_cycles: f64,
     pub(crate) true_ah: f64,
     pub(crate) mean_ah: f64,
     pub(crate) std_ah: f64,
-    /// Whether the half-cycle carried information. If not, no rule is evaluated.
+    /// Whether the half-cycle gave a capacity measurement. If not, no rule is evaluated.
     pub(crate) is_measured: bool,
     /// Changes of the Monitor's own alarms of severity info, warning and severe.
     pub(crate) reported: [Option<Change>; 3],
@@ -126,7 +122,6 @@ pub(crate) struct Place {
     pub(crate) full_cycles: f64,
 }
 
-/// What was recorded during a life.
 #[derive(Debug, Clone)]
 pub(crate) struct Life {
     pub(crate) evaluations: Vec<Evaluation>,
@@ -135,8 +130,8 @@ pub(crate) struct Life {
     pub(crate) resets: u32,
 }
 
-/// Ageing: the capacity (fraction of rated) falls from `start` by `loss * x^curvature`, where x = charge moved /
-/// `span_ah`. The resistance grows by `growth * x`.
+/// Ageing: the capacity (fraction of rated) falls from `start` by `loss * x^curvature`. Here x is the moved charge
+/// divided by `span_ah`. The resistance grows by `growth * x`.
 #[derive(Debug, Clone, Copy)]
 struct Fade {
     start: f64,
@@ -215,7 +210,6 @@ fn true_model(model: &CellModel, dice: &mut Dice) -> CellModel {
     truth
 }
 
-/// A simulation in progress.
 struct Rig {
     fade: Fade,
     pack: Pack,
@@ -230,7 +224,6 @@ struct Rig {
     life: Life,
 }
 
-/// A life's sensors: fixed errors drawn once, and the random numbers for the noise.
 struct Sensors {
     set: SensorSet,
     gain: f64,
@@ -266,8 +259,8 @@ impl Sensors {
     }
 }
 
-/// Simulates one life. An ageing cell is followed past its end of life (`AFTERLIFE`), a healthy cell until it has moved
-/// the charge `span_ah`.
+/// Simulates one life: an ageing cell past its end of life (`AFTERLIFE`), a healthy cell until the charge `span_ah` has
+/// been moved.
 pub(crate) fn live(config: &MonitorConfig, set: &SensorSet, kind: Kind, seed: u64) -> Life {
     let mut rig = Rig::new(config, set, kind, seed);
     let mut after = 0;
@@ -323,7 +316,7 @@ impl Rig {
         Place { cycle: f64::from(self.half_cycles) / 2.0, full_cycles: self.truth().throughput_ah / (2.0 * RATED_AH) }
     }
 
-    /// One cycle: discharge, pause, charge, pause; a swing of 30 to 80 % with random currents and a random temperature.
+    /// One cycle: discharge, pause, charge, pause. The swing is 30 to 80 % SOC; currents and temperature are random.
     fn cycle(&mut self) {
         let usage = &mut self.usage;
         let (low, high) = (usage.uniform(0.12, 0.38), usage.uniform(0.68, 0.92));
@@ -351,7 +344,6 @@ impl Rig {
         self.pause(current_a, pauses_s[1]);
     }
 
-    /// Sets the fade of the next half-cycle: the average slope of the fade curve over that half-cycle.
     fn age(&mut self) {
         let moved_ah = self.truth().throughput_ah;
         self.pack.set_ageing(self.fade.ageing(moved_ah, 0.5 * MOVED_PER_CYCLE * RATED_AH));
@@ -384,7 +376,7 @@ impl Rig {
         self.pack.step(current_a, dt_s);
         self.time = time.plus_secs(dt_s);
         let (mut place, health) = (self.place(), self.truth().capacity_ah / RATED_AH);
-        place.cycle += 0.5; // dated to the end of the half-cycle, when the crossing could first be known
+        place.cycle += 0.5; // the crossing can be detected only at the end of the half-cycle
         let (life, beyond) = (&mut self.life, |limit: f64| (health < limit).then_some(place));
         life.crossing = life.crossing.or(beyond(THRESHOLD));
         life.end = life.end.or(beyond(END_OF_LIFE));

@@ -2,9 +2,11 @@
 //! (from the alarm to the end of life) and the false alarms.
 //!
 //! Each simulated life runs through the whole core: a cell with its own fade, sensors with their own errors, frames,
-//! Monitor. Every rule then judges the Monitor's capacity estimates. The Monitor itself also runs three of the rules
-//! and must raise their alarms at the same half-cycles. Each test run judges a few lives. The whole study (200 ageing
-//! and 100 healthy lives, each with three sensor sets) writes `tests/alarm_tradeoff.md` and takes some minutes:
+//! Monitor. Every rule then evaluates the Monitor's capacity estimates. The Monitor itself also runs three of the rules
+//! and must raise their alarms at the same half-cycles.
+//!
+//! A test run simulates a few lives. The whole study has 200 ageing and 100 healthy lives, each with three sensor sets.
+//! It takes some minutes and writes `tests/alarm_tradeoff.md`:
 //! `PACKWATCH_WRITE_TRADEOFF=1 cargo test --workspace --test integration alarm_tradeoff -- --nocapture`
 
 mod calibration;
@@ -20,19 +22,18 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use judged::{CANDIDATES, HALF, MEAN, MONITORED, P95, judge};
 use life::{Kind, Life, SENSOR_SETS, SensorSet};
 
-/// Ageing lives of the whole study, per sensor set.
+/// Ageing lives per sensor set in the whole study.
 const LIVES: usize = 200;
-/// Healthy lives of the whole study, per sensor set.
+/// Healthy lives per sensor set in the whole study.
 const HEALTHY: usize = 100;
-/// Seeds: the n-th ageing life has `AGEING_SEED + n`, the n-th healthy one `HEALTHY_SEED + n`.
+/// The n-th ageing life has the seed `AGEING_SEED + n`, the n-th healthy life has `HEALTHY_SEED + n`.
 const AGEING_SEED: u64 = 1_000;
 const HEALTHY_SEED: u64 = 5_000;
-/// Numbers of ageing and of healthy lives that every test run judges.
+/// Numbers of ageing and healthy lives in an ordinary test run.
 const QUICK: (usize, usize) = (6, 3);
 
 const WRITE: &str = "PACKWATCH_WRITE_TRADEOFF";
 
-/// All lives simulated with one sensor set.
 struct Fleet {
     set: &'static SensorSet,
     ageing: Vec<Life>,
@@ -54,7 +55,6 @@ impl Fleet {
         self.ageing.iter().chain(&self.healthy)
     }
 
-    /// Checks what must hold for every sensor set.
     fn check(&self) {
         assert!(
             self.ageing.iter().all(|life| life.crossing.is_some() && life.end.is_some()),
@@ -82,7 +82,7 @@ impl Fleet {
     }
 }
 
-/// Runs `work(0..count)` on all processors. Results are in order.
+/// Runs `work(0..count)` on all processors. Returns the results in order.
 fn in_parallel<T: Send>(count: usize, work: impl Fn(usize) -> T + Sync) -> Vec<T> {
     let (next, done) = (AtomicUsize::new(0), Mutex::new(Vec::with_capacity(count)));
     let threads = std::thread::available_parallelism().map_or(1, usize::from);

@@ -1,4 +1,4 @@
-//! Prints the results of the study as the tables of `tests/alarm_tradeoff.md`.
+//! Formats the results of the study as `tests/alarm_tradeoff.md`.
 
 use std::fmt::Write as _;
 
@@ -7,7 +7,7 @@ use super::calibration::{EDGES, bins, errors};
 use super::judged::{CANDIDATES, Candidate, RuleOutcome, judge};
 use super::life::Life;
 
-/// The median of the values, and their 5 % and 95 % quantiles in parentheses.
+/// The median of the values, followed by their 5 % and 95 % quantiles in parentheses.
 fn range(mut values: Vec<f64>, digits: usize) -> String {
     values.sort_by(f64::total_cmp);
     let Some(last) = values.len().checked_sub(1) else { return "-".to_owned() };
@@ -59,7 +59,6 @@ pub(crate) fn rules_table(fleet: &Fleet) -> String {
     text
 }
 
-/// The whole document.
 pub(crate) fn document(fleets: &[Fleet]) -> String {
     let mut text = include_str!("head.md").to_owned();
     for fleet in fleets {

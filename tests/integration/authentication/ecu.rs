@@ -1,5 +1,5 @@
-//! Simulates a sender of authenticated commands, built from the manual's description, and a bus between this sender and
-//! the core.
+//! Simulates an ECU that sends authenticated commands, as the manual describes, and the bus between this ECU and the
+//! core.
 
 use std::cell::RefCell;
 
@@ -27,7 +27,7 @@ pub(crate) fn key(byte: u8) -> CanKey {
     CanKey::parse(&[byte, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15]).unwrap()
 }
 
-/// The rig's configuration, with commands authenticated by `profile` instead of protected end to end.
+/// The test rig's configuration, with commands authenticated by `profile` instead of protected end to end.
 pub(crate) fn config(profile: &str, more: &str) -> MonitorConfig {
     let secoc = format!("secoc = \"{profile}\"\n");
     let fd = if profile == "fd" { "fd = true\n" } else { "" };
@@ -37,11 +37,11 @@ pub(crate) fn config(profile: &str, more: &str) -> MonitorConfig {
     config_texts::load(&format!("{pack}{tables}{more}"), DBC).monitor
 }
 
-/// The sender. It keeps no state across restarts: to restart the sender, create a new one with [`Ecu::new`].
+/// The sender. It keeps no state across restarts.
 pub(crate) struct Ecu {
     key: CanKey,
     pub(crate) authentication: Authentication,
-    /// The freshness of the next command; `None` = wait for an announcement.
+    /// Freshness of the next command; `None` until an announcement arrives.
     next: Option<u64>,
     announced: u64,
 }
@@ -52,7 +52,7 @@ impl Ecu {
         Self { key, authentication, next: None, announced: 0 }
     }
 
-    /// Handles an announcement: ignores it if its authenticator is wrong or its freshness is not higher.
+    /// Handles an announcement. Ignores one with a wrong authenticator or an old freshness.
     pub(crate) fn handle_frame(&mut self, frame: &Frame) {
         if frame.id() != CanId::standard(FRESHNESS).unwrap() {
             return;
@@ -70,14 +70,13 @@ impl Ecu {
         }
     }
 
-    /// Makes a command; `None` if the announced values are used up.
+    /// Creates a command. Returns `None` if all announced freshness values are used.
     pub(crate) fn command(&mut self, command: u8, cell: u16) -> Option<Frame> {
         let freshness = self.next.filter(|next| *next < self.announced + 16)?;
         self.next = Some(freshness + 1);
         Some(self.encode_command(command, cell, freshness))
     }
 
-    /// Makes a command with the given freshness.
     pub(crate) fn encode_command(&self, command: u8, cell: u16, freshness: u64) -> Frame {
         let codes = u32::from(command) | 31 << 4 | u32::from(cell) << 11;
         let mut payload = codes.to_le_bytes().to_vec();
@@ -94,7 +93,7 @@ pub(crate) fn frame_of(payload: &[u8]) -> Frame {
     if payload.len() <= 8 { Frame::classic(id, payload) } else { Frame::fd(id, false, false, payload) }.unwrap()
 }
 
-/// A tick (`None`), or a frame with its freshness. The freshness is `None` if the authenticator is wrong.
+/// A journal entry: a tick (`None`), or a frame with its freshness (`None` if the authenticator is wrong).
 pub(crate) type JournalLine = Option<(Frame, Option<u64>)>;
 
 /// The daemon on a simulated bus, with manual time.
@@ -106,9 +105,8 @@ pub(crate) struct Daemon {
     pub(crate) ms: i64,
     /// Frames that the daemon sent during the last `pass` or `receive`, with their authenticators.
     pub(crate) sent: Vec<Frame>,
-    /// Commands executed since the start.
     pub(crate) executed: u64,
-    /// Inputs as a journal stores them; `None` = not recorded.
+    /// Recorded inputs, as a journal stores them; `None`: do not record.
     pub(crate) journal: Option<Vec<(i64, JournalLine)>>,
     pub(crate) macs: RefCell<u64>,
 }

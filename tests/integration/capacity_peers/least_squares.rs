@@ -1,9 +1,9 @@
-//! Estimates the capacity by published least-squares methods. Their input is swings: a swing is a change of SOC x
-//! (fraction) and the charge y (Ah) that caused it. y = Q x, with Q the capacity (Ah). sx and sy are the standard
-//! deviations of x and y.
+//! Estimates the capacity by published least-squares methods. Their input is a list of swings. A swing is a change of
+//! SOC x (fraction) and the charge y (Ah) that caused it, so y = Q x with the capacity Q (Ah). sx and sy are the
+//! standard deviations of x and y.
 //!
 //! G. L. Plett, "Recursive approximate weighted total least squares estimation of battery cell total capacity", J.
-//! Power Sources 196 (2011) 2319. All methods have fading memory:
+//! Power Sources 196 (2011) 2319. Every method gives older swings less weight (fading memory):
 //!
 //! - WLS (weighted least squares): only y has errors
 //! - TLS (total least squares): x and y have errors, with the same ratio sx/sy for all swings
@@ -14,13 +14,13 @@
 //! - c1 = sum w x^2/sy^2, c2 = sum w xy/sy^2, c3 = sum w y^2/sy^2
 //! - c4 = sum w x^2/sx^2, c5 = sum w xy/sx^2, c6 = sum w y^2/sx^2
 //!
-//! AWTLS minimises the cost sum w (Q^2/sx^2 + 1/sy^2) (y - Q x)^2 / (Q^2 + 1)^2. Before that, y and sy are scaled by
-//! K = sx/sy, so that Q is near 1, where the approximation holds. The minimum is at a root of a quartic in Q. The
-//! variance is 2 divided by the cost's second derivative at the minimum.
+//! AWTLS minimises the cost sum w (Q^2/sx^2 + 1/sy^2) (y - Q x)^2 / (Q^2 + 1)^2. Because this approximation holds for Q
+//! near 1, y and sy are first scaled by K = sx/sy. The minimum is at a root of a quartic in Q. The variance is 2
+//! divided by the cost's second derivative at the minimum.
 
 use packwatch::filter::ScalarGaussian;
 
-/// One measured swing.
+/// A measured swing.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Swing {
     /// Change of SOC (fraction).
@@ -51,8 +51,8 @@ pub(crate) struct Peer {
 }
 
 impl Peer {
-    /// Starts from a prior capacity as Plett does: with one full swing (x = 1) whose charge is that capacity. The
-    /// prior's standard deviation is split between x and y.
+    /// Starts from a prior capacity as Plett does: with one full swing (x = 1) whose charge is the prior capacity. The
+    /// prior's variance is split between x and y.
     pub(crate) fn new(method: Method, gamma: f64, start: ScalarGaussian) -> Self {
         let mut peer = Self { method, gamma, c: [0.0; 6], x_information: 0.0, y_information: 0.0 };
         let y_variance = 0.5 * start.variance;
@@ -63,7 +63,7 @@ impl Peer {
 
     pub(crate) fn take(&mut self, swing: &Swing) {
         let Swing { x, x_variance, y_ah: y, y_variance } = *swing;
-        // WLS has errors in y only, so convert the errors in x to errors in y with the present capacity estimate.
+        // WLS has errors in y only, so convert the errors in x with the present capacity estimate.
         let y_variance = match self.method {
             Method::Wls => {
                 let q = if self.c[0] > 0.0 { self.c[1] / self.c[0] } else { y / x };
@@ -93,12 +93,12 @@ impl Peer {
         }
     }
 
-    /// K = sx/sy, as an average over all swings: from the sums of 1/sx^2 and of 1/sy^2.
+    /// K = sx/sy, averaged over all swings.
     fn scale(&self) -> f64 {
         (self.y_information / self.x_information).sqrt()
     }
 
-    /// The running sums after y has been scaled by `k`.
+    /// The running sums for y scaled by `k`.
     fn scaled(&self, k: f64) -> [f64; 6] {
         let [c1, c2, c3, c4, c5, c6] = self.c;
         [c1 / (k * k), c2 / k, c3, c4, k * c5, k * k * c6]
@@ -170,8 +170,7 @@ fn positive_roots(value: impl Fn(f64) -> f64, slope: impl Fn(f64) -> f64) -> Vec
 mod tests {
     use super::*;
 
-    /// Uniform numbers in [0, 1) by splitmix64. The sum of twelve of them, minus six, approximates a normal
-    /// number.
+    /// Uniform numbers in [0, 1) by splitmix64. The sum of twelve numbers, minus six, is approximately normal.
     struct Random(u64);
 
     impl Random {
@@ -188,8 +187,7 @@ mod tests {
         }
     }
 
-    /// Draws swings of a 10 Ah cell. Random errors are added to the true x and y. Their variances are in the swing's
-    /// fields `x_variance` and `y_variance`.
+    /// Draws swings of a 10 Ah cell with random errors in x and y.
     fn swings(random: &mut Random, count: usize, even: bool) -> Vec<Swing> {
         let one = |random: &mut Random| {
             let wide = if even { 1.0 } else { 0.5 + random.uniform() };
@@ -246,7 +244,7 @@ mod tests {
     #[test]
     fn awtls_equals_tls_for_constant_ratio() {
         let list = swings(&mut Random(7), 30, true);
-        // With 10 Ah, the prior has the same ratio sx/sy as the swings.
+        // A prior of 10 Ah has the same ratio sx/sy as the swings.
         let [a, b] =
             [Method::Awtls, Method::Tls].map(|m| run(m, 0.9, ScalarGaussian::from_std(10.0, 1.0), &list).capacity());
         assert!((a.mean - b.mean).abs() < 1e-9 && (a.variance / b.variance - 1.0).abs() < 1e-9, "{a:?} {b:?}");

@@ -1,8 +1,8 @@
-//! Compares capacity estimates with the published capacities of two measured cells (NASA PCoE B0005, B0006). The
-//! records are replayed complete, and in windows (a random part of each record).
+//! Compares capacity estimates with the published capacities of two measured cells (NASA PCoE B0005, B0006). The cells'
+//! records are replayed whole, and in windows (a random part of each record).
 //!
-//! Discharges are numbered from 1, and scores count from discharge 11 on. The published capacity first falls below
-//! 1.4 Ah at discharge 125 (B0005) and 109 (B0006).
+//! Discharges are numbered from 1; scores start at discharge 11. The published capacity first falls below 1.4 Ah at
+//! discharge 125 (B0005) and 109 (B0006).
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -38,7 +38,8 @@ fn seconds(stamp: &str) -> f64 {
         + stamp[17..].parse::<f64>().unwrap()
 }
 
-/// The shipped configuration of `cell`, with `start` times its capacity as the initial capacity.
+/// The shipped configuration of `cell`. The initial capacity is wrong by the factor `start`. If `held`, the
+/// capacity is not learned.
 fn configuration(folder: &Path, cell: &str, start: f64, held: bool) -> PathBuf {
     let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
     let mut text = std::fs::read_to_string(shipped.join("measured.toml")).unwrap();
@@ -49,7 +50,7 @@ fn configuration(folder: &Path, cell: &str, start: f64, held: bool) -> PathBuf {
     let new_ah = if cell == "B0005" { 1.9216 } else { 2.1059 };
     text = text.replace("[pack]\n", &format!("[pack]\ninitial_capacity_ah = {}\n", start * new_ah));
     if held {
-        // Also keep nominal measurements from changing the capacity.
+        // Nominal measurements must not change the capacity either.
         let fixed = "[capacity]\nmethod = \"nominal\"\nnominal_swing = 0.9\nnominal_variance_ah2 = 1e6\nnoise_ah_per_cycle = 0.0\n";
         text = text.replace("[capacity]\n", fixed) + "\n[estimator]\ncapacity_state = \"held\"\n";
     }
@@ -58,7 +59,6 @@ fn configuration(folder: &Path, cell: &str, start: f64, held: bool) -> PathBuf {
     path
 }
 
-/// The monitor's report after a discharge.
 struct DischargeReport {
     time_s: f64,
     discharge: usize,
@@ -75,7 +75,7 @@ struct Life {
     filter: Vec<(f64, Source)>,
     outer: Vec<(f64, Source)>,
     loaded: Vec<(f64, Source)>,
-    /// Swings of the filter's SOC between the same ends as in `loaded`.
+    /// Swings of the filter's SOC with the same ends as in `loaded`.
     filter_at_ends: Vec<(f64, Source)>,
 }
 
@@ -157,7 +157,7 @@ impl Life {
         let number = |key: &str| event[key].as_f64().unwrap();
         let ours = ScalarGaussian::from_std(number("usable_capacity_ah"), number("usable_capacity_std_ah"));
         let (capacity_ah, ratio) = (number("capacity_ah"), number("resistance_ratio"));
-        // Find the SOC at full charge with which `usable_ah` gives the usable capacity that the monitor has reported.
+        // Search the SOC at full charge at which `usable_ah` returns the reported usable capacity.
         let (mut low, mut high) = (0.5, 1.5);
         for _ in 0..30 {
             let middle = 0.5 * (low + high);
@@ -172,8 +172,7 @@ impl Life {
         self.config.health.usable.as_ref().unwrap()
     }
 
-    /// Converts a capacity to usable capacity. The standard deviation includes the uncertainty of the resistance,
-    /// treated as independent of the capacity.
+    /// Converts a capacity to usable capacity. The uncertainty of the resistance is treated as independent.
     fn to_usable_capacity(&self, reported: &DischargeReport, capacity: ScalarGaussian) -> ScalarGaussian {
         let at = |capacity_ah: f64, ratio: f64| {
             usable_ah(&self.config.model, self.usable(), reported.full_soc, capacity_ah, (ratio, 1.0))
@@ -220,7 +219,6 @@ fn print(life: &str, name: &str, source: &str, (score, below): (Score, Option<us
     );
 }
 
-/// Prints packwatch's row of the table. Returns packwatch's score.
 fn print_ours(name: &str, life: &Life) -> Score {
     assert!(life.reported.len() > 145, "{name}: {} discharges", life.reported.len());
     let ours = life.ours();
@@ -228,7 +226,6 @@ fn print_ours(name: &str, life: &Life) -> Score {
     ours.0
 }
 
-/// Prints the peers' rows of the table for one source of swings. Returns the peers' scores.
 fn print_peers(name: &str, source: &str, life: &Life, swings: &[(f64, Source)]) -> Vec<Score> {
     let score = |&(peer, method, gamma): &(&str, Method, f64)| {
         let scored = life.scored(&life.peer((method, gamma), swings));
@@ -247,12 +244,12 @@ fn heading() {
     println!("| --- | --- | --- | --- | --- | --- |");
 }
 
-/// packwatch's error may exceed the best peer's error by this (Ah) if the peers use swings of the filter's SOC. This
-/// SOC depends on the capacity that packwatch has learned, which helps the peers.
+/// Allowed excess over the best peer's error if the peers use the filter's SOC (Ah). This SOC contains the capacity
+/// that packwatch has learned, which helps the peers.
 const NEAR_AH: f64 = 0.006;
 
-/// packwatch's error may exceed the best peer's error by this (Ah) if the peers use voltage swings: an eighth of a
-/// percent of the capacity. The best peer has an advantage: its memory factor is chosen after the results are known.
+/// Allowed excess over the best peer's error if the peers use voltage swings (Ah). It is an eighth of a percent of
+/// the capacity. The best peer is chosen after the results are known.
 const LEVEL_AH: f64 = 0.0025;
 
 #[test]
@@ -275,12 +272,11 @@ fn usable_capacity_of_whole_lives_matches_best_peer() {
     }
 }
 
-/// Maximum ratio of packwatch's error to the best peer's error, over all windows. The best peer's memory
-/// factor is chosen after the results are known.
+/// Allowed ratio to the best peer's error, both averaged over all windows.
 const LEVEL: f64 = 1.1;
 
-/// In this test the filter's swings use the same ends as the voltage swings, because swing and charge of a `half_cycle`
-/// event can disagree after a gap.
+/// After a gap, the swing and the charge of a `half_cycle` event can disagree. Therefore the filter's swings use the
+/// same ends as the voltage swings.
 #[test]
 #[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
 fn usable_capacity_from_windows_matches_best_peer() {
@@ -306,8 +302,8 @@ fn usable_capacity_from_windows_matches_best_peer() {
         best_ah = best_ah.min(score.mean_absolute);
     }
     assert!(ours.mean_absolute <= LEVEL * best_ah, "{ours:?}, the best peer {best_ah}");
-    // packwatch's coverage is too low, because the interval does not include errors of the open-circuit curve that
-    // differ between the two ends of a swing.
+    // The 95 % interval covers too few true values: it ignores errors of the open-circuit curve that differ between the
+    // ends of a swing.
     assert!(ours.covered > 0.5, "{ours:?}");
 }
 

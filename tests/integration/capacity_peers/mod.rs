@@ -2,15 +2,16 @@
 //!
 //! A swing is a change of SOC and the charge that caused it. The peers get swings from three sources:
 //!
-//! - `filter`: the filter's own SOC at both ends, with its deviation, from the event `half_cycle`. If the log
-//!   contains only windows (a random part of each record), the ends are the same as for `voltage`
-//! - `voltage`: the SOC at both ends by inversion of the open-circuit curve (`swings`). The peer's present capacity
-//!   estimate is used only to compute how ageing changes the curve's shape
-//! - `filter, capacity held`: the filter's SOC, always counted with the wrong initial capacity
+//! - `filter`: the filter's SOC at both ends, with its standard deviation, from the event `half_cycle`. In windows (a
+//!   random part of each record), the ends are the same as for `voltage`.
+//! - `voltage`: the SOC at both ends from the inverted open-circuit curve (`swings`). The peer's present capacity
+//!   estimate is used only to compute how ageing changes the shape of the curve.
+//! - `filter, capacity held`: the filter's SOC, counted with the wrong initial capacity.
 //!
-//! The published capacity of a measured cell is the one delivered at 2 A, not the capacity between open-circuit
-//! voltages. Each peer's capacity is therefore converted by packwatch's calculation of the usable capacity, with the
-//! same resistance and the same full SOC, so that only the capacities differ.
+//! The published capacity of a measured cell is the charge delivered at 2 A, not the capacity between open-circuit
+//! voltages. packwatch's calculation of the usable capacity therefore converts each peer's capacity. It uses the same
+//! resistance and the same full SOC for all peers, so that only the capacities differ.
+//!
 //! `cargo test --workspace --test integration capacity_peers -- --nocapture` prints the tables of tests/candidates.md.
 
 mod least_squares;
@@ -39,14 +40,13 @@ const PEERS: [(&str, Method, f64); 11] = [
     ("AWTLS gamma 0.20", Method::Awtls, 0.2),
 ];
 
-/// A swing, by source.
 #[derive(Debug, Clone, Copy)]
 enum Source {
     Filter(Swing),
     Voltage(VoltageSwing),
 }
 
-/// A peer's capacity at each requested time, from the swings that began before that time.
+/// A peer's capacity at each of `times_s`, from the swings that began before that time.
 fn follow(
     model: &CellModel,
     config: &CapacityConfig,
@@ -64,7 +64,7 @@ fn follow(
                 Source::Filter(swing) => *swing,
                 Source::Voltage(weighed) => weighed.swing(model, config, peer.capacity().mean),
             };
-            // Skip swings with the wrong sign, which a flat or wrong curve produces; no method can use them.
+            // A flat or wrong curve can give a swing with the wrong sign. No method can use such a swing.
             if swing.x > 0.0 {
                 peer.take(&swing);
             }
@@ -81,7 +81,6 @@ struct Score {
     covered: f64,
 }
 
-/// Scores pairs of estimate and truth.
 fn score(pairs: impl Iterator<Item = (ScalarGaussian, f64)>) -> Score {
     let (mut count, mut sum, mut covered) = (0.0, 0.0, 0.0);
     for (belief, truth) in pairs {

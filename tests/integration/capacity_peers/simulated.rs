@@ -1,9 +1,7 @@
-//! Runs the comparison on simulated lives with known true capacity: the paper's life, a life that ages a tenth as fast,
-//! and a life without ageing (as total least squares assumes). The sensors are as in the paper's scenario: voltage
-//! noise 5 mV; current noise 20 mA, offset 10 mA and gain error 0.5 %; 1 s samples. The SOC runs from 30 to 90 %, and
-//! the initial capacity is 20 % wrong.
-//!
-//! The third source of swings is the filter's SOC with its capacity held at the wrong initial value.
+//! Runs the comparison on simulated lives with known true capacity: the life of `config/paper.toml`, a life that ages a
+//! tenth as fast, and a life without ageing (as total least squares assumes). The sensors are as in the scenario
+//! `paper`: voltage noise 5 mV; current noise 20 mA, offset 10 mA and gain error 0.5 %; 1 s samples. The SOC runs from
+//! 30 to 90 %, and the initial capacity is 20 % wrong.
 
 use std::path::Path;
 
@@ -20,12 +18,11 @@ use super::{PEERS, Score, Source, follow, score};
 use crate::support::simulated_cell;
 
 const NEW_AH: f64 = 2.6;
-/// Relative standard deviation of the initial capacity, and also its relative error.
+/// Relative standard deviation and actual relative error of the initial capacity.
 const START_STD: f64 = 0.2;
-/// Half-cycles excluded from the scores (two full cycles), because the initial value still affects every method.
+/// Half-cycles without a score because the initial value still affects every method.
 const SETTLING: usize = 4;
 
-/// Report at the end of a half-cycle.
 struct CapacityReport {
     time_s: f64,
     true_ah: f64,
@@ -54,8 +51,8 @@ fn configuration(start: f64, held: bool) -> MonitorConfig {
 
 fn live(config: &MonitorConfig, settings: Settings) -> Life {
     let mut life = Life { reported: Vec::new(), filter: Vec::new(), readings: Vec::new() };
-    // Keep the true capacity of a minute ago, because a half-cycle is reported after its end, when further fade has
-    // been applied.
+    // A half-cycle is reported after its end, when the cell has faded further. Therefore compare with the true capacity
+    // of a minute ago.
     let mut past_ah = std::collections::VecDeque::from(vec![settings.pack.capacity_ah; 60]);
     simulated_cell::live(config.clone(), settings, |time, sim, monitor, events| {
         past_ah.push_back(sim.pack().cells()[0].capacity_ah);
@@ -96,7 +93,6 @@ impl Life {
         }
     }
 
-    /// Score of each peer on these swings.
     fn peers(&self, config: &MonitorConfig, swings: &[(f64, Source)]) -> Vec<(Score, f64)> {
         let start =
             ScalarGaussian::from_std(config.estimator.initial.capacity_ah, config.estimator.initial.capacity_std_ah);
@@ -133,14 +129,12 @@ fn print(life: &str, start: f64, name: &str, source: &str, (score, last): (Score
     );
 }
 
-/// The lives: name and capacity fade per cycle (Ah).
+/// Name and capacity fade per cycle (Ah).
 const LIVES: [(&str, f64); 3] = [("none", 0.0), ("0.005 Ah per cycle", 0.005), ("0.05 Ah per cycle", 0.05)];
-/// Number of cycles in the paper's life.
 const CYCLES: u32 = 48;
 
-/// packwatch's relative error may exceed the best peer's by this (0.1 %), if the peers use the filter's own SOC. This
-/// SOC depends on the capacity that packwatch has learned, and all methods share the current sensor's gain error of
-/// 0.5 %.
+/// Allowed excess over the best peer's relative error if the peers use the filter's SOC. This SOC contains the capacity
+/// that packwatch has learned.
 const NEAR: f64 = 0.001;
 
 #[test]
@@ -157,8 +151,7 @@ fn simulated_capacity_matches_best_peer() {
     }
 }
 
-/// Prints all table rows of a life. Fails if packwatch is worse than the best peer, or if swings counted with the wrong
-/// capacity give a good result.
+/// Prints all table rows of a life and checks the limits.
 fn compare(name: &str, start: f64, settings: Settings) {
     let config = configuration(start, false);
     let (life, held) = (live(&config, settings), live(&configuration(start, true), settings));

@@ -2,10 +2,10 @@
 //!
 //! The open-circuit voltage is V + I R0 rho + sum U, with V the cell's voltage, I the current (positive = discharge),
 //! R0 the series resistance, rho the filter's resistance ratio and U the voltages of the RC branches. The voltages U
-//! are simulated in open loop, starting at 0. If the record begins under load, readings count only after 180 s. Each
-//! end of a swing is the mean of all readings in the swing's first or last 60 s, each with the charge that had flowed
-//! until that reading. A capacity is assumed only to compute how ageing changes the shape of the curve. The standard
-//! deviation of the SOC at an end is the one that packwatch uses (`[capacity]`).
+//! are simulated in open loop, starting at 0. If the record begins under load, readings count only after 180 s.
+//!
+//! Each end of a swing is a mean over the swing's first or last 60 s. A capacity is assumed only to compute how ageing
+//! changes the shape of the curve.
 
 use packwatch::cell::aged_ocv::SHIFT_STD;
 use packwatch::cell::circuit::BranchAt;
@@ -14,18 +14,17 @@ use packwatch::health::CapacityConfig;
 
 use super::least_squares::Swing;
 
-/// If the interval between two readings is longer than this (s), the charge in between is unknown.
+/// If two readings are more than this apart (s), the charge between them is unknown.
 const GAP_S: f64 = 60.0;
 /// Current below which the cell counts as resting (A).
 const REST_A: f64 = 0.05;
-/// Three time constants of the models' slowest RC branch (s). After this time the branch's unknown initial voltage has
-/// decayed.
+/// Three time constants of the models' slowest RC branch (s). Then the branch's unknown initial voltage has decayed.
 const SETTLING_S: f64 = 180.0;
 /// Length of each end of a swing (s).
 const END_S: f64 = 60.0;
-/// A swing ends when this part of the model's capacity has flowed back.
+/// A swing ends when this fraction of the model's capacity has flowed back.
 const REVERSAL: f64 = 0.02;
-/// Smallest swing used, as a part of the model's capacity.
+/// Smallest swing used, as a fraction of the model's capacity.
 const MIN_SWING: f64 = 0.05;
 /// White noise of a voltage reading (V).
 const VOLTAGE_NOISE_V: f64 = 0.005;
@@ -38,28 +37,25 @@ pub(crate) struct Reading {
     pub(crate) current_a: f64,
     pub(crate) temperature_c: f64,
     pub(crate) resistance_ratio: f64,
-    /// The filter's SOC and its variance.
     pub(crate) soc: f64,
     pub(crate) soc_variance: f64,
 }
 
-/// SOC, charge and variance of one reading, or the means of several readings.
+/// SOC, charge and variance of one reading, or means over several readings.
 #[derive(Debug, Clone, Copy, Default)]
 struct Point {
     time_s: f64,
     /// SOC according to the open-circuit curve of the new cell.
     new_soc: f64,
-    /// Variance of `new_soc`.
     variance: f64,
     /// Charge removed since the start (Ah).
     charge_ah: f64,
-    /// The filter's SOC and its variance.
     soc: f64,
     soc_variance: f64,
     known: bool,
 }
 
-/// A swing with the data to weigh it.
+/// The two ends of a swing, before a capacity is assumed.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct VoltageSwing {
     pub(crate) start_s: f64,
@@ -79,7 +75,7 @@ impl VoltageSwing {
         self.between(config, a - b, a_variance + b_variance)
     }
 
-    /// Swing with the filter's own SOC at the same ends.
+    /// Swing of the filter's SOC between the same ends.
     pub(crate) fn filter_swing(&self, config: &CapacityConfig) -> Swing {
         let [a, b] = &self.ends;
         self.between(config, a.soc - b.soc, a.soc_variance + b.soc_variance)
@@ -96,7 +92,8 @@ impl VoltageSwing {
 pub(crate) fn charge_variance(config: &CapacityConfig, charge_ah: f64, duration_s: f64) -> f64 {
     let gain_ah = config.current_gain_std * charge_ah;
     let offset_ah = config.current_offset_std_a * duration_s / 3600.0;
-    // A configuration may state neither gain nor offset: the standard deviation is at least a thousandth of the charge.
+    // The configuration may give neither gain nor offset. The standard deviation is therefore at least 0.1 % of the
+    // charge.
     (gain_ah * gain_ah + offset_ah * offset_ah).max(1e-6 * charge_ah * charge_ah)
 }
 
@@ -107,10 +104,10 @@ fn aged_soc(model: &CellModel, new_soc: f64, capacity_ah: f64) -> f64 {
     model.soc_of_aged_ocv(&model.temperature_position(ANY_C), capacity_ah, voltage_v)
 }
 
-/// Readings that form the ends.
+/// Readings that form the ends of a swing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Ends {
-    /// The first and last readings, at rest if the cell rests.
+    /// All readings, including those at rest.
     Outer,
     /// Only readings with current.
     Loaded,
@@ -140,10 +137,10 @@ pub(crate) fn weigh(model: &CellModel, config: &CapacityConfig, ends: Ends, read
     swings
 }
 
-/// Index of the charge reversal, once enough charge has flowed back.
+/// Index of the point at which the current reversed, once enough charge has flowed back.
 fn reversal(model: &CellModel, points: &[Point]) -> Option<usize> {
     let (first, last) = (points.first()?.charge_ah, points.last()?.charge_ah);
-    // Checking at every 32nd point is enough: until the charge of a reversal has flowed back, many more points follow.
+    // Checking every 32nd point is enough because the reverse charge takes many points to flow.
     if !points.len().is_multiple_of(32) {
         return None;
     }
@@ -167,7 +164,7 @@ fn between_ends(model: &CellModel, points: &[Point]) -> Option<VoltageSwing> {
     (moved_ah > MIN_SWING * model.capacity_ah).then_some(VoltageSwing { start_s, end_s, ends })
 }
 
-/// Mean of points. The curve's errors are common to all points, so the variance does not fall with their number.
+/// Mean of points. The curve's errors are the same at all points, so averaging does not reduce the variance.
 fn mean<'a>(points: impl Iterator<Item = &'a Point> + Clone) -> Point {
     let n = points.clone().count() as f64;
     let of = |value: fn(&Point) -> f64| points.clone().map(value).sum::<f64>() / n;
@@ -182,7 +179,6 @@ fn mean<'a>(points: impl Iterator<Item = &'a Point> + Clone) -> Point {
     }
 }
 
-/// State of the RC branches, in open loop.
 #[derive(Debug, Default)]
 struct Circuit {
     last: Option<Reading>,
@@ -202,7 +198,7 @@ impl Circuit {
     fn step(&mut self, model: &CellModel, config: &CapacityConfig, reading: &Reading) -> Point {
         let &Reading { time_s, voltage_v, current_a, temperature_c, resistance_ratio, .. } = reading;
         let mut load_v = self.branch_v.iter().sum::<f64>();
-        // The resistance depends on the SOC, which depends on the open-circuit voltage: three passes converge.
+        // The resistance depends on the SOC, and the SOC depends on the resistance. Three passes converge.
         let mut soc = 0.5;
         for _ in 0..3 {
             let r0_ohm = model.r0_ohm(&model.grid_position(soc, temperature_c)) * resistance_ratio;

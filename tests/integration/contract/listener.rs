@@ -6,7 +6,7 @@ use packwatch::can::dbc::{Database, Message, Signal};
 use packwatch::can::signal::SignalPlan;
 use packwatch::can::{CanId, Frame};
 
-/// Maps rule, severity and cell, as the frames carry them, to state and acknowledgement.
+/// Maps rule, severity and cell to state and acknowledgement. All values are codes as in the frames.
 pub(crate) type AlarmTable = BTreeMap<(u64, u64, u64), (u64, bool)>;
 
 /// Number of passes per cycle. In one pass each raised alarm is sent once. If the listener receives no frame of an
@@ -14,7 +14,6 @@ pub(crate) type AlarmTable = BTreeMap<(u64, u64, u64), (u64, bool)>;
 const CYCLE_PASSES: i64 = 4;
 const TIMEOUT_PASSES: i64 = 7;
 
-/// Signals of a message by name.
 struct Reader {
     id: CanId,
     signals: BTreeMap<String, (SignalPlan, Signal)>,
@@ -31,7 +30,7 @@ impl Reader {
         self.signals[name].0.raw(frame.data()).unwrap()
     }
 
-    /// Whether the frame's page contains the signal.
+    /// Whether the signal is on the frame's page.
     fn has(&self, frame: &Frame, name: &str) -> bool {
         let page = self.raw(frame, "Page");
         self.signals.get(name).is_some_and(|(_, signal)| {
@@ -39,7 +38,6 @@ impl Reader {
         })
     }
 
-    /// Code of an entry in the signal's value table.
     fn code(&self, name: &str, word: &str) -> u64 {
         let table = &self.signals[name].1.values;
         u64::try_from(table.iter().find(|(_, other)| other == word).unwrap().0).unwrap()
@@ -56,7 +54,7 @@ struct Entry {
 pub(crate) struct Listener {
     alarm: Reader,
     digest: Reader,
-    /// States of a raised alarm.
+    /// State codes of a raised alarm.
     raised_states: [u64; 3],
     entries: BTreeMap<(u64, u64, u64), Entry>,
     pass_ms: i64,
@@ -126,7 +124,7 @@ impl Listener {
         self.entries.iter().map(|(key, entry)| (*key, (entry.state, entry.is_acknowledged))).collect()
     }
 
-    /// Whether the last digest matches the table.
+    /// Whether the table agrees with the last digest.
     pub(crate) fn is_confirmed(&mut self, now_ms: i64) -> bool {
         let table = self.table(now_ms);
         let sum = table.iter().fold(0_u16, |sum, (key, entry)| sum.wrapping_add(crc(*key, *entry)));

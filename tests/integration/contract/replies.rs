@@ -1,5 +1,4 @@
-//! Tests replies to commands, the pages of the digest (a cyclic summary of all alarms), and counters across a kill of
-//! the daemon, with hand-made frames.
+//! Tests replies to commands, the digest (a cyclic summary of all alarms), and counters across a kill of the daemon.
 
 use packwatch::alarm::Rule;
 use packwatch::can::e2e::{Profile, Protection};
@@ -41,7 +40,6 @@ impl Rig {
         })
     }
 
-    /// A field of the last frame of a digest page.
     fn digest(&self, page: u64, start: u32, length: u32) -> u64 {
         let frames = self.frames_with(DIGEST);
         field(frames.iter().rev().find(|frame| field(frame, 16, 4) == page).unwrap(), start, length)
@@ -99,7 +97,7 @@ fn acknowledge_reply_follows_changed_alarm_frames() {
 #[test]
 fn long_downtime_restarts_all_cyclic_frames() {
     for away in [Downtime::Seconds(1.0), Downtime::Seconds(2.3), Downtime::Seconds(60.0), Downtime::Unknown] {
-        // Also stop at times other than the end of a period.
+        // Also stop between the ends of two periods.
         for more_deci in [0, 1, 6] {
             let mut rig = Rig::new("");
             rig.seconds(3);
@@ -168,7 +166,6 @@ fn digest_shows_unjudged_rule_as_unknown() {
     assert_eq!([9, 8, 1].map(|number| rule(&rig, number)), [2, 4, 5], "no input received yet");
     rig.seconds(3);
     assert_eq!([9, 8].map(|number| rule(&rig, number)), [2, 0]);
-    // One of two sensors has a reading.
     let mut rig = Rig::new(HOT);
     rig.temperatures_c = [Some(25.0), None];
     rig.seconds(12);
@@ -223,11 +220,10 @@ fn end_of_unknown_is_announced_across_kill() {
     }
 }
 
-/// The protected messages of the counter tests: identifier, data id, frames per period, period in tenths of a second.
+/// Protected messages of the counter tests: identifier, data id, frames per period, period in tenths of a second.
 const COUNTED: [(u32, u16, i64, i64); 4] =
     [(STATUS, 1, 1, 1), (HEALTH, 2, 5, 10), (ALARM, 3, 1, 5), (DIGEST, 4, 4, 10)];
 
-/// A rig whose four messages are protected with `profile`, in FD frames, with a threshold for the temperature.
 fn protected_rig(profile: Profile) -> Rig {
     let keys = |data_id: u32| format!("fd = true\ne2e = \"{}\"\ndata_id = {data_id}\n", profile.name());
     let pack = PACK
@@ -243,16 +239,15 @@ fn counters(rig: &Rig, id: u32, protection: Protection) -> Vec<i64> {
     rig.frames_with(id).iter().map(counter).collect()
 }
 
-/// Time from the stored state to the kill, and from the kill to the first tick of the next run, in tenths of a second.
+/// Age of the stored state at the kill, and time from the kill to the first tick of the next run, in tenths of a
+/// second.
 const KILLS: [(i64, i64); 5] = [(0, 3), (7, 0), (16, 2), (130, 25), (31, 600)];
 
-/// Kills a daemon with one raised alarm. Returns two values for each message of [`COUNTED`]. The first is the number of
-/// counter steps from the last frame before the kill to the first frame after the kill. The second is the minimum and
-/// maximum number of steps of a daemon that never stopped.
+/// Kills a daemon with one raised alarm. For each message of [`COUNTED`], returns the counter steps over the kill, and
+/// the minimum and maximum steps if the daemon had not stopped.
 fn steps_over_a_kill(profile: Profile, unstored_deci: i64, away_deci: i64) -> [(i64, [i64; 2]); 4] {
     let mut rig = protected_rig(profile);
-    // Raise the alarm and send its repetitions. After that the daemon sends the alarm only at its regular
-    // period.
+    // Raise the alarm and wait for its repetitions. After them the daemon sends the alarm only at its regular period.
     rig.heat(60.0, 6);
     let stored = rig.monitor.snapshot();
     (0..unstored_deci).for_each(|_| rig.tick_with_frames());
@@ -271,7 +266,6 @@ fn steps_over_a_kill(profile: Profile, unstored_deci: i64, away_deci: i64) -> [(
     std::array::from_fn(|n| {
         let (id, data_id, frames, period_deci) = COUNTED[n];
         let first = counters(&rig, id, of(data_id))[0];
-        // Whole periods between the last frame before the kill and the first one after it.
         let lost = away_deci / period_deci;
         let allowed = [lost, lost + 1].map(|periods| (periods * frames + 1).rem_euclid(turn));
         ((first - before[n]).rem_euclid(turn), allowed)

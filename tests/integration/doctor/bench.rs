@@ -1,5 +1,4 @@
-//! Creates healthy packs for the tests of `packwatch doctor`: configurations, DBC files and simulated logs. The tests
-//! put faults into these packs.
+//! Creates healthy packs for the tests of `packwatch doctor`: configurations, DBC files and simulated logs.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -19,7 +18,7 @@ pub(crate) enum Bench {
     Pack96,
     /// One cell, protected end to end.
     Protected,
-    /// Only the total voltage of 96 cells, and a temperature sensor.
+    /// Only a temperature sensor and the total voltage of 96 cells.
     Total,
     /// One cell, discharged with random pulses; the voltage has 32 mV of noise.
     Pulses,
@@ -156,7 +155,7 @@ fn log(bench: Bench, seed: u64) -> String {
     made.clone()
 }
 
-/// A pack to put a fault into.
+/// A pack into which a test puts a fault.
 #[derive(Debug, Clone)]
 pub(crate) struct BrokenPack {
     pub(crate) bench: Bench,

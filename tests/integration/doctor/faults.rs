@@ -5,7 +5,7 @@ use packwatch::wiring::Topic;
 use super::bench::Bench::{self, Charge, Day, Pack12, Pack96, Protected, Pulses, Steady, Total, Walk};
 use super::bench::BrokenPack;
 
-/// A fault to put into a pack.
+/// A fault that is put into a pack.
 pub(crate) struct Fault {
     pub(crate) name: &'static str,
     pub(crate) breaks: fn(&mut BrokenPack),
@@ -48,7 +48,6 @@ fn temperatures(broken: &mut BrokenPack, keys: &str) {
     broken.table("[[input.temperature]]", keys);
 }
 
-/// Swaps two signals' names in the configuration.
 fn exchange(broken: &mut BrokenPack, a: &str, b: &str) {
     broken.config(&format!("\"{a}\""), "\"@\"");
     broken.config(&format!("\"{b}\""), &format!("\"{a}\""));
@@ -174,7 +173,7 @@ pub(crate) const FAULTS: &[Fault] = &[
         2,
     ),
     fault(
-        // The pack is at about 10 degrees C, so the number itself looks plausible.
+        // The pack is at about 10 degrees C, where the number in Fahrenheit still looks plausible.
         "Fahrenheit in the DBC, not converted",
         |b| b.dbc("(0.1,0) [-40|125] \"degC\"", "(0.18,5) [-40|300] \"degF\""),
         &[Topic::Unit],

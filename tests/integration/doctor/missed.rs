@@ -1,4 +1,4 @@
-//! Lists faults that `packwatch doctor` once missed, in the form of `faults`.
+//! Lists further faults in the form of `faults`. `packwatch doctor` once missed each of them.
 
 use packwatch::wiring::Topic;
 
@@ -29,8 +29,8 @@ fn set(data: &mut [u8], page: u8, at: usize, value: i32) {
     }
 }
 
-/// Adds a second bus on which another sender uses identifier 100. This sender sends the first sender's current,
-/// inverted and delayed. The configured current is on interface `on`.
+/// Adds a second bus. Another sender on this bus uses identifier 100 to send the first sender's current, inverted and
+/// delayed. The configured current is on interface `on`.
 fn second_bus(broken: &mut BrokenPack, on: &str) {
     broken.config("[[interface]]\nname = \"can0\"", "[[interface]]\nname = \"can1\"\n\n[[interface]]\nname = \"can0\"");
     broken.table("[input.cell_voltage]", "interface = \"can0\"");
@@ -82,7 +82,7 @@ pub(crate) fn two_socs(broken: &mut BrokenPack, dash: u8) {
     });
 }
 
-/// Name of a healthy pack, and the change that makes this pack.
+/// Name of a healthy pack, and the change that creates it.
 type Change = (&'static str, fn(&mut BrokenPack));
 
 /// Further healthy packs, with the additional inputs that the doctor checks.

@@ -1,8 +1,6 @@
-//! Tests `packwatch doctor` against injected faults. Healthy packs are simulated with several configurations, scenarios
-//! and seeds. Then one fault is put into the configuration, the DBC or the log. The doctor's first finding must be this
-//! fault. On healthy packs the doctor must find nothing.
-//!
-//! `faults` is the table: name, how to break the pack, expected first finding, proposed line.
+//! Tests `packwatch doctor`. One fault of the table `faults` is put into the configuration, the DBC or the log of a
+//! healthy simulated pack. The doctor's first finding must be this fault. In healthy packs the doctor must find
+//! nothing.
 
 mod bench;
 mod cli;
@@ -14,12 +12,11 @@ use faults::{FAULTS, Fault};
 use missed::MISSED;
 use packwatch::wiring::{Severity, Topic, WiringReport};
 
-/// First seed. Set `PACKWATCH_FIRST_SEED` for packs that no earlier run used.
+/// First seed. Set `PACKWATCH_FIRST_SEED` to test other packs.
 fn first_seed() -> u64 {
     std::env::var("PACKWATCH_FIRST_SEED").ok().and_then(|text| text.parse().ok()).unwrap_or(1)
 }
 
-/// Healthy packs, and the number of seeds of each.
 const HEALTHY: &[(Bench, u64)] = &[
     (Bench::Pack12, 6),
     (Bench::Pack96, 2),

@@ -1,10 +1,10 @@
-//! Tests random configurations: each one that `check` accepts must run without a panic and accept its own stored state.
+//! Tests random configurations. Each configuration that `check` accepts must run without a panic and accept its own
+//! stored state.
 
 use super::*;
 
 const REFERENCE: &str = include_str!("../../../docs/src/reference/keys.md");
 
-/// Tables with random numbers.
 const TABLES: [&str; 9] = [
     "pack",
     "estimator",
@@ -17,12 +17,11 @@ const TABLES: [&str; 9] = [
     "limits.temperature",
 ];
 
-/// Rounds of readings per configuration. One configuration in [`LONG_ONE_IN`] gets [`LONG_ROUNDS`].
+/// Rounds of readings per configuration. One of [`LONG_ONE_IN`] configurations runs for [`LONG_ROUNDS`] rounds.
 const ROUNDS: usize = 16;
 const LONG_ROUNDS: usize = 80;
 const LONG_ONE_IN: usize = 8;
 
-/// A numeric key and its range.
 struct NumberKey {
     table: &'static str,
     name: &'static str,
@@ -59,7 +58,7 @@ fn keys() -> Vec<NumberKey> {
 }
 
 impl NumberKey {
-    /// Draws a value of the range: an end, a uniform number, or a random order of magnitude.
+    /// Draws a value within the range: an end, a uniform number, or a number of random order of magnitude.
     fn draw(&self, dice: &mut Dice) -> f64 {
         let least = if self.is_low_open { self.low + 1e-9 * (self.high - self.low).min(1.0) } else { self.low };
         match dice.below(6) {
@@ -75,7 +74,6 @@ impl NumberKey {
     }
 }
 
-/// Draws a number with a random order of magnitude.
 fn magnitude(dice: &mut Dice, low: f64, high: f64) -> f64 {
     dice.between(low.ln(), high.ln()).exp()
 }
@@ -115,7 +113,7 @@ fn configuration(dice: &mut Dice, keys: &[NumberKey]) -> (String, String) {
     let is_usual = !dice.one_in(4);
     let capacity_ah = if is_usual { magnitude(dice, 1.0, 100.0) } else { magnitude(dice, 1.1e-3, 0.9e5) };
     let share = [2, 5, 20][dice.below(3)];
-    // packwatch compares cells with each other only if there are at least three.
+    // packwatch compares cells with each other only if the pack has at least three.
     let base = PACK.replace("cells/example_nmc_2600.toml", "cell.toml").replace("cells = 2\n", "cells = 3\n");
     let mut tables: Vec<(&str, String)> = Vec::new();
     for key in keys.iter().filter(|key| key.table != "usable") {
@@ -154,7 +152,6 @@ fn configuration(dice: &mut Dice, keys: &[NumberKey]) -> (String, String) {
     let mut text = base;
     for (table, lines) in tables {
         let header = format!("[{table}]\n");
-        // Insert keys into an existing table.
         text = match text.find(&header) {
             Some(place) => {
                 let (before, after) = text.split_at(place + header.len());
@@ -172,7 +169,7 @@ fn configuration(dice: &mut Dice, keys: &[NumberKey]) -> (String, String) {
     (text, cell_model(dice, capacity_ah, is_usual))
 }
 
-/// Feeds random readings to an accepted configuration, then restores its own state.
+/// Feeds random readings to a monitor, then restores the monitor's state.
 fn run(config: &MonitorConfig, dice: &mut Dice) -> Result<(), String> {
     let (mut monitor, mut out, encoder) =
         (Monitor::new(config.clone()), Outputs::default(), InputEncoder::new(&config.input));

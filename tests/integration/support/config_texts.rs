@@ -1,10 +1,10 @@
-//! Loads a configuration from texts: `pack.toml` and `pack.dbc` as given, other files (cell models) as shipped.
+//! Loads a configuration from texts of `pack.toml` and `pack.dbc`, with the shipped cell models.
 
 use std::path::Path;
 
 use packwatch::config::{self, Config, ConfigFiles};
 
-/// Loads the configuration. If it is faulty, panics with all its faults.
+/// Loads the configuration. Panics with all its faults.
 pub(crate) fn load(pack: &str, dbc: &str) -> Config {
     let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
     let read = |path: &Path| match path.to_str() {

@@ -1,6 +1,4 @@
-//! Measured data: the folder named by `PACKWATCH_DATA`, or the folder next to the project.
-//!
-//! Tests that need measured data are ignored without `cfg(measured_data)`, which the build script sets.
+//! Paths of the measured data: the folder `PACKWATCH_DATA`, or else `../shared/data` next to the project.
 
 use std::path::{Path, PathBuf};
 

@@ -6,7 +6,7 @@ use std::io::Write;
 use std::path::Path;
 use std::process::{Command, Stdio};
 
-/// The interpreter that `PACKWATCH_PYTHON` names. If the variable is not set, prints a note and returns `None`.
+/// The value of `PACKWATCH_PYTHON`. If the variable is not set, prints a note and returns `None`.
 pub(crate) fn python() -> Option<OsString> {
     let python = std::env::var_os("PACKWATCH_PYTHON");
     if python.is_none() {
@@ -22,7 +22,7 @@ pub(crate) fn ask(python: &OsString, dbc: &Path, arguments: &[&str], lines: &[St
     command.arg(script).arg(dbc).args(arguments).stdin(Stdio::piped()).stdout(Stdio::piped());
     let mut child = command.spawn().unwrap();
     let (mut stdin, text) = (child.stdin.take().unwrap(), lines.join("\n"));
-    // Ignore write errors: if the oracle fails, its exit status shows that.
+    // Ignore write errors. The oracle's exit status reports a failure.
     let writer = std::thread::spawn(move || stdin.write_all(text.as_bytes()));
     let output = child.wait_with_output().unwrap();
     let _ = writer.join().unwrap();

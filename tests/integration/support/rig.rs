@@ -91,11 +91,11 @@ pub(crate) struct Rig {
     pub(crate) out: Outputs,
     pub(crate) events: Vec<Event>,
     pub(crate) frames: Vec<Frame>,
-    /// Identifiers sent, and whether the frames announce a change.
+    /// Sent identifiers, and whether the frame announces a change.
     pub(crate) sent: BTreeSet<(CanId, bool)>,
     pub(crate) deci: i64,
     pub(crate) commands_sent: u8,
-    /// Content of the next frames; `None` = no frame.
+    /// Content of the next frames; `None`: no frame is sent.
     pub(crate) current_a: Option<f64>,
     pub(crate) voltages_v: [Option<f64>; 2],
     pub(crate) temperatures_c: [Option<f64>; 2],
@@ -198,7 +198,7 @@ impl Rig {
         result
     }
 
-    /// Ends the process and restarts it after `away`. Advances the clock by that time if it is known.
+    /// Ends the process and restarts it after `away`. If the downtime is known, advances the clock by it.
     pub(crate) fn restart(&mut self, away: Downtime) {
         let text = serde_json::to_string(&self.monitor.snapshot()).unwrap();
         let snapshot: Snapshot = serde_json::from_str(&text).unwrap();
@@ -209,9 +209,9 @@ impl Rig {
         }
     }
 
-    /// A discharge deep enough to learn every cell's capacity.
+    /// Discharges deeply enough to learn every cell's capacity.
     pub(crate) fn discharge(&mut self) {
-        // Voltage drop at 5 A. A current that steps without the voltages would be doubted.
+        // Voltage drop at 5 A. If the current stepped without the voltages, the monitor would distrust the current.
         const DROP_V: f64 = 0.08;
         self.seconds(20);
         self.current_a = Some(5.0);
@@ -253,7 +253,6 @@ impl Rig {
         *self.wire().iter().rev().find(|wire| wire.rule == rule as u8).unwrap_or_else(|| panic!("no frame of {rule:?}"))
     }
 
-    /// `UnknownRules` of the last status frame.
     pub(crate) fn unknown_rules(&self) -> u8 {
         let status = self.frames.iter().rev().find(|frame| frame.id() == CanId::Standard(0x6B0)).unwrap();
         status.data()[7] >> 6
@@ -274,7 +273,7 @@ pub(crate) fn command_frame(code: u64, rule: u64, cell: u64, counter: u8) -> Fra
     Frame::classic(CanId::Standard(1715), &payload).unwrap()
 }
 
-/// A rig whose pack was discharged deeply enough that every cell's capacity is learned and below the threshold.
+/// A rig after a discharge deep enough to learn every cell's capacity, with all capacities below the threshold.
 pub(crate) fn learned() -> Rig {
     let mut rig = Rig::new("[[alarm]]\nrule = \"capacity_low\"\nwarning = 5.0\n[estimator]\ngate_sigma = 1000\n");
     rig.discharge();

@@ -1,5 +1,4 @@
-//! Runs a simulated cell through the whole core in one process: true cell -> sensors -> frames of the DBC -> Monitor,
-//! with the ticks of a replay. Shared by the tests that judge the estimates.
+//! Runs a simulated cell through the whole core, with the ticks of a replay.
 
 use packwatch::can::encode::InputEncoder;
 use packwatch::io::ticks::Ticks;
@@ -7,11 +6,10 @@ use packwatch::monitor::{Event, Monitor, MonitorConfig, Outputs, Record, TICK_PE
 use packwatch::quantity::Timestamp;
 use packwatch::sim::{Simulation, Wiring};
 
-/// Sleep gap (s): if no input arrives for longer than this time, the recorder counts as asleep. These simulations have
-/// no such gap.
+/// Sleep gap (s). These simulations have no such gap.
 const SLEEP_GAP_S: f64 = 30.0;
 
-/// Runs `settings` to the end. After each step calls `each` with the time, the truth, the core and the core's events.
+/// Runs `settings` to the end. Calls `each` after each step.
 pub(crate) fn live(
     config: MonitorConfig,
     settings: packwatch::sim::Settings,

@@ -1,4 +1,4 @@
-//! Makes gaps in measured lives: keeps only a window of each record. A seed always gives the same windows.
+//! Makes gaps in measured lives: keeps only a random part (window) of each record.
 
 use std::path::Path;
 
@@ -24,8 +24,8 @@ impl Uniform {
     }
 }
 
-/// Writes the life to `to`, keeping only a random window of 40 to 70 % of each record. Time stamps are unchanged, so
-/// the removed rows become a gap of known length and unknown current.
+/// Writes the life to `to` with only a random window of 40 to 70 % of each record. The removed rows become a gap of
+/// known length and unknown current.
 pub(crate) fn windowed(life: &Path, to: &Path, seed: u64, by: WindowUnit) {
     let file = std::io::BufReader::new(flate2::read::GzDecoder::new(std::fs::File::open(life).unwrap()));
     let mut reader = csv::Reader::from_reader(file);
@@ -47,7 +47,7 @@ pub(crate) fn windowed(life: &Path, to: &Path, seed: u64, by: WindowUnit) {
     writer.flush().unwrap();
 }
 
-/// Time (s) or charge moved (A s) from the start of the record to each row.
+/// Time (s) or moved charge (A s) from the start of the record to each row.
 fn along(record: &[csv::StringRecord], by: WindowUnit) -> Vec<f64> {
     let number = |row: &csv::StringRecord, column: usize| row[column].parse::<f64>().unwrap();
     let mut along = vec![0.0];

@@ -1,9 +1,9 @@
-//! The same drive as the exports of cyclers and applications write it. Headers, preambles and conventions follow the
-//! exports themselves.
+//! One drive in the export formats of cyclers and applications. Headers, preambles and conventions are those of real
+//! exports.
 
 use std::fmt::Write as _;
 
-/// One second of the drive; a positive current is a discharge.
+/// One second of the drive, discharge positive.
 #[derive(Clone, Copy)]
 pub(super) struct Sample {
     pub(super) second: u32,
@@ -28,7 +28,7 @@ pub(super) fn drive() -> Vec<Sample> {
     (0..900).map(sample).collect()
 }
 
-/// An export: its name, its file name, the text, and whether it has the temperature of 25 degrees C.
+/// An export: its name, its file name, its text, and whether it contains the temperature (25 degrees C).
 pub(super) struct Export {
     pub(super) name: &'static str,
     pub(super) file: &'static str,
@@ -52,7 +52,6 @@ fn volt(s: Sample) -> String {
     format!("{:.3}", f64::from(s.voltage_mv) / 1000.0)
 }
 
-/// Seconds as `h:mm:ss`, with two digits of hours.
 fn clock(second: u32) -> String {
     format!("{:02}:{:02}:{:02}", second / 3600, second / 60 % 60, second % 60)
 }
@@ -65,7 +64,6 @@ fn state(s: Sample, words: [&'static str; 3]) -> &'static str {
     }]
 }
 
-/// Latin-1 and UTF-16 of a text.
 fn latin1(text: &[u8]) -> Vec<u8> {
     String::from_utf8_lossy(text).chars().map(|c| c as u32 as u8).collect()
 }
@@ -95,7 +93,7 @@ fn export(name: &'static str, file: &'static str, has_temperature: bool, bytes: 
     Export { name, file, bytes, has_temperature }
 }
 
-/// Cyclers that count a charge as positive.
+/// Exports of cyclers, in which a charge is positive.
 fn cyclers(rows: &[Sample]) -> Vec<Export> {
     let bdf = |s: Sample| format!("{},{},{},25", s.second, volt(s), ampere(-s.current_ma));
     let arbin = |s: Sample| {
@@ -233,7 +231,7 @@ fn cyclers(rows: &[Sample]) -> Vec<Export> {
     ]
 }
 
-/// Exports with the magnitude of the current and a state.
+/// Exports that contain the magnitude of the current and a state (charge, discharge, rest).
 fn magnitudes(rows: &[Sample]) -> Vec<Export> {
     let maccor = |time: String, s: Sample| {
         let step = state(s, ["D", "C", "R"]);
@@ -268,7 +266,7 @@ fn magnitudes(rows: &[Sample]) -> Vec<Export> {
     ]
 }
 
-/// Programs and applications.
+/// Exports of programs and applications.
 fn programs(rows: &[Sample]) -> Vec<Export> {
     let pybamm = |s: Sample| format!("{}.0,{},{},298.15,0.1", s.second, ampere(s.current_ma), volt(s));
     let cellpy = |s: Sample| {
@@ -358,7 +356,7 @@ fn programs(rows: &[Sample]) -> Vec<Export> {
     ]
 }
 
-/// Encodings, separators and line ends.
+/// Exports with various encodings, separators and line ends.
 fn forms(rows: &[Sample]) -> Vec<Export> {
     let german =
         |s: Sample| format!("{},0;{};{}", s.second, ampere(s.current_ma).replace('.', ","), volt(s).replace('.', ","));
@@ -393,7 +391,7 @@ fn forms(rows: &[Sample]) -> Vec<Export> {
     ]
 }
 
-/// Headers whose columns need a choice, and rows that need a decision.
+/// Exports with several possible columns for a value, or with unusual rows.
 fn headers(rows: &[Sample]) -> Vec<Export> {
     type Row<'a> = (&'static str, &'static str, &'a str, bool, &'a dyn Fn(Sample) -> String);
     let (a, v) = (|s: Sample| ampere(s.current_ma), volt);

@@ -1,4 +1,4 @@
-//! Tables of sample documents.
+//! Tests the tables of sample documents.
 
 use super::*;
 use crate::cli::status::sample::sample;

@@ -14,16 +14,13 @@ use crate::status::document::StatusDocument;
 /// Number of documents that are kept for the plots. They cover four minutes.
 pub(super) const HISTORY: usize = 240;
 
-/// An update from the stream.
 #[derive(Debug)]
 pub(super) enum FeedUpdate {
-    /// A document.
     StatusDocument(Box<StatusDocument>),
     /// The connection failed, for this reason.
     Lost(String),
 }
 
-/// The pages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Page {
     Cells,
@@ -58,7 +55,7 @@ pub(super) const MAPPED: [(Quantity, &str); 2] = [(Quantity::Soc, "SOC"), (Quant
 /// A cell's values in one document, one per quantity in [`MAPPED`].
 pub(super) type CellPoint = [Option<f32>; MAPPED.len()];
 
-/// The view.
+/// The state of the view.
 #[derive(Debug)]
 pub(super) struct App {
     path: PathBuf,
@@ -68,14 +65,11 @@ pub(super) struct App {
     /// Time of the last document, and the reason why no newer document arrives. Set from a loss of the connection until
     /// the next document.
     pub(super) lost: Option<(Option<Timestamp>, String)>,
-    /// Time at which the latest document was received.
     received_at: Option<Timestamp>,
-    /// History of each cell, oldest first.
     pub(super) history: Vec<VecDeque<CellPoint>>,
     pub(super) page: Page,
     /// Index in [`MAPPED`] of the quantity that the cell map shows.
     pub(super) mapped: usize,
-    /// The selected cell.
     pub(super) selected: usize,
     /// First visible line of a page other than the cell map.
     pub(super) scroll: usize,
@@ -87,7 +81,7 @@ pub(super) struct App {
 }
 
 impl App {
-    /// Creates a view. `path` is the status socket; the stream socket is next to it.
+    /// Creates a view. `path` is the status socket; the stream socket is in the same folder.
     pub(super) fn new(path: PathBuf, has_colour: bool) -> Self {
         Self {
             path,
@@ -106,7 +100,6 @@ impl App {
         }
     }
 
-    /// Path of the status socket.
     pub(super) fn path(&self) -> &Path {
         &self.path
     }
@@ -121,7 +114,6 @@ impl App {
         }
     }
 
-    /// Handles an update of the stream.
     pub(super) fn handle_update(&mut self, updates: FeedUpdate) {
         match updates {
             FeedUpdate::Lost(why) => self.lose(why),

@@ -17,7 +17,6 @@ use crate::status::document::StatusDocument;
 /// Smallest usable size, columns and lines.
 const LEAST: (u16, u16) = (40, 12);
 
-/// Draws everything.
 pub(super) fn draw(frame: &mut Frame<'_>, app: &mut App) {
     let area = frame.area();
     if area.width < LEAST.0 || area.height < LEAST.1 {

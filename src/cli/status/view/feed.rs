@@ -10,13 +10,12 @@ use crate::quantity::Timestamp;
 use crate::status::client::parse;
 use crate::status::stream::follow;
 
-/// The computer's clock.
 pub(super) fn now() -> Timestamp {
     Timestamp::from_nanos(Reading::now().realtime_ns)
 }
 
-/// Starts reading the stream socket next to the status socket at `path`. Errors name the status socket, as the options
-/// `--status` and `--socket` do.
+/// Starts reading the stream socket that belongs to the status socket at `path`. Errors name the status socket, as the
+/// options `--status` and `--socket` do.
 pub(super) fn start(path: PathBuf) -> mpsc::Receiver<FeedUpdate> {
     // One update is drawn while the next is read. An update that arrives while both places are taken is dropped.
     let (updates, received) = mpsc::channel(1);

@@ -27,7 +27,6 @@ const LEAST_SOC_RANGE: f64 = 0.05;
 /// Minimum height of the selected cell's plot, including its title.
 const PLOT_LINES: usize = 5;
 
-/// Draws the selected page.
 pub(super) fn page(frame: &mut Frame<'_>, app: &mut App, document: &StatusDocument, theme: Theme, area: Rect) {
     let lines = match app.page {
         Page::Cells => return cells(frame, app, document, theme, area),
@@ -62,7 +61,6 @@ fn cells(frame: &mut Frame<'_>, app: &mut App, document: &StatusDocument, theme:
     }
 }
 
-/// Layout of the cell map.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Grid {
     /// Width of a cell in characters, including the space between cells.
@@ -72,8 +70,8 @@ struct Grid {
 }
 
 impl Grid {
-    /// Chooses the widest bars with which all cells fit in at most `lines` rows, and in at most four. Otherwise,
-    /// chooses bars of one character; if the rows still do not fit, the map scrolls.
+    /// Chooses the widest cells with which all cells fit into `lines` rows and into four rows. If no such width exists,
+    /// chooses cells of one character. If the rows still do not fit, the map scrolls.
     fn new(cells: usize, width: usize, lines: usize) -> Self {
         let with = |cell_width: usize| {
             let fit = (width.saturating_sub(LABEL) / cell_width).max(1);
@@ -153,7 +151,6 @@ fn list(app: &App, document: &StatusDocument, theme: Theme, area: Rect) -> Vec<L
     text
 }
 
-/// Plot of the selected cell.
 fn plot(frame: &mut Frame<'_>, app: &App, theme: Theme, area: Rect) {
     let Some(points) = app.history.get(app.selected) else { return };
     let width = usize::from(area.width.saturating_sub(2));
@@ -270,7 +267,6 @@ fn counts(document: &StatusDocument) -> Vec<Line<'static>> {
     text
 }
 
-/// Lists the events, newest first.
 fn events(document: &StatusDocument) -> Vec<Line<'static>> {
     let mut text: Vec<Line<'_>> =
         document.events.iter().rev().map(|event| Line::from(event_line(event, document))).collect();

@@ -21,7 +21,6 @@ pub(super) fn sparkline(values: impl ExactSizeIterator<Item = Option<f64>>, widt
     blank + &values.iter().map(|value| bar(value.and_then(|value| scale?.share(value)))).collect::<String>()
 }
 
-/// Range from the smallest to the largest value.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct ValueRange {
     pub(super) least: f64,

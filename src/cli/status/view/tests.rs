@@ -127,7 +127,7 @@ fn silent_cell_is_not_drawn_as_trusted() {
     let mut app = app();
     app.handle_update(FeedUpdate::StatusDocument(Box::new(sample(3))));
     let screen = drawn(&mut app, SMALL);
-    // First row of the map: trusted, not trusted, silent. The first cell is selected.
+    // The first row of the map shows a trusted, an untrusted and a silent cell. The first cell is selected.
     let row =
         (0..SMALL.1).find(|row| (0..5).map(|x| screen.buffer()[(x, *row)].symbol()).eq([" ", " ", " ", "1", " "]));
     let colours: Vec<Color> = [5, 9, 13].map(|x| screen.buffer()[(x, row.unwrap())].fg).to_vec();

@@ -188,7 +188,6 @@ fn restored_engine_behaves_like_stored_engine() {
 /// and the value that raised it last.
 type KeptThreshold = (bool, u32, bool, [Option<Timestamp>; 2], Option<f64>);
 
-/// The part of every alarm's state that a restart keeps.
 fn kept(state: &AlarmSnapshot, rules: &[RuleConfig]) -> Vec<KeptThreshold> {
     let mut engine = AlarmEngine::new(rules.to_vec(), 2);
     engine.restore(at(1e6), state);

@@ -1,7 +1,7 @@
-//! Attributes of a DBC: cycle time, repetition, frame format, end-to-end protection, authentication.
+//! Reads message attributes of a DBC.
 //!
-//! The attribute names and the order of the values of `VFrameFormat` follow DBC editors. The attributes for end-to-end
-//! protection and authentication are specific to packwatch. An invalid attribute counts as missing.
+//! DBC editors define the attribute names and the order of the values of `VFrameFormat`. The attributes for end-to-end
+//! protection and authentication are packwatch's own. An invalid attribute counts as missing.
 
 use can_dbc::{AttributeDefinition, AttributeValue, AttributeValueType, Dbc, MessageId};
 
@@ -9,15 +9,10 @@ use super::{FrameFormat, Repetition};
 use crate::can::e2e::{Profile, Protection};
 use crate::can::secoc::{self, Authentication};
 
-/// Cycle time, ms.
 pub(super) const CYCLE_TIME: &str = "GenMsgCycleTime";
-/// Number of frames after the first frame of an event.
 pub(super) const REPETITIONS: &str = "GenMsgNrOfRepetition";
-/// Time between the frames of an event, ms.
 pub(super) const FAST_CYCLE_TIME: &str = "GenMsgCycleTimeFast";
-/// Smallest mean time between two frames, ms.
 pub(super) const DELAY_TIME: &str = "GenMsgDelayTime";
-/// Kind of the frames: standard or extended identifier, classic or FD.
 pub(super) const FRAME_FORMAT: &str = "VFrameFormat";
 pub(super) const FRAME_FORMATS: [&str; 16] = {
     let mut words = ["reserved"; 16];
@@ -25,11 +20,11 @@ pub(super) const FRAME_FORMATS: [&str; 16] = {
     (words[FIRST_FD_FORMAT], words[FIRST_FD_FORMAT + 1]) = ("StandardCAN_FD", "ExtendedCAN_FD");
     words
 };
-/// Index of the format of J1939 in [`FRAME_FORMATS`].
+/// Index in [`FRAME_FORMATS`].
 pub(super) const J1939_FORMAT: usize = 3;
-/// Protocol of the whole bus.
+/// Attribute of the whole bus.
 const PROTOCOL: &str = "ProtocolType";
-/// Index of the first FD format in [`FRAME_FORMATS`].
+/// Index in [`FRAME_FORMATS`].
 pub(super) const FIRST_FD_FORMAT: usize = 14;
 pub(super) const BIT_RATE_SWITCH: &str = "CANFD_BRS";
 pub(super) const NO_YES: [&str; 2] = ["0", "1"];
@@ -58,14 +53,14 @@ pub(super) fn positive(dbc: &Dbc, id: MessageId, name: &str) -> Option<u32> {
     let whole = match dbc.resolved_message_attribute(id, name)? {
         AttributeValue::Uint(ms) => u32::try_from(*ms).ok(),
         AttributeValue::Int(ms) => u32::try_from(*ms).ok(),
-        // Some editors export every number as a float: parse 100.0 as 100.
+        // Some editors export every number as a float, such as 100.0 for 100.
         AttributeValue::Double(ms) => format!("{:.0}", ms.round()).parse().ok(),
         AttributeValue::String(ms) => ms.parse().ok(),
     };
     whole.filter(|ms| *ms > 0)
 }
 
-/// Frame format; classic unless the attribute says FD.
+/// Frame format of the message; classic unless the attribute names an FD format.
 pub(super) fn format(dbc: &Dbc, id: MessageId) -> FrameFormat {
     match word(dbc, id, FRAME_FORMAT).as_deref() {
         Some("StandardCAN_FD" | "ExtendedCAN_FD") => {
@@ -75,7 +70,7 @@ pub(super) fn format(dbc: &Dbc, id: MessageId) -> FrameFormat {
     }
 }
 
-/// Whether the message is a J1939 parameter group. If no message has a frame format, the protocol of the bus decides.
+/// Whether the message is a J1939 parameter group. If the frame format is missing, the protocol of the bus decides.
 pub(super) fn is_j1939(dbc: &Dbc, id: MessageId) -> bool {
     let of_bus = || {
         let value = dbc.attribute_values_database.iter().find(|value| value.name == PROTOCOL)?;
@@ -88,14 +83,14 @@ pub(super) fn is_j1939(dbc: &Dbc, id: MessageId) -> bool {
         }
 }
 
-/// The protection, if both attributes are valid.
+/// `None` if profile or data ID is missing or invalid.
 pub(super) fn e2e(dbc: &Dbc, id: MessageId) -> Option<Protection> {
     let name = word(dbc, id, E2E_PROFILE)?;
     let profile = [Profile::P01A, Profile::P01C, Profile::P05].into_iter().find(|profile| profile.name() == name)?;
     Some(Protection { profile, data_id: data_id(dbc, id, E2E_DATA_ID)? })
 }
 
-/// The authentication, if both attributes are valid.
+/// `None` if profile or data ID is missing or invalid.
 pub(super) fn secoc(dbc: &Dbc, id: MessageId) -> Option<Authentication> {
     let name = word(dbc, id, SECOC_PROFILE)?;
     let profile = secoc::Profile::ALL.into_iter().find(|profile| profile.name() == name)?;
@@ -109,7 +104,7 @@ fn data_id(dbc: &Dbc, id: MessageId, name: &str) -> Option<u16> {
     }
 }
 
-/// The name of an enumeration attribute's value. The DBC gives the name itself or its index.
+/// Name of an enumeration attribute's value, which the DBC gives by name or by index.
 fn word(dbc: &Dbc, id: MessageId, name: &str) -> Option<String> {
     let place = match dbc.resolved_message_attribute(id, name)? {
         AttributeValue::String(word) => return Some(word.clone()),

@@ -1,29 +1,26 @@
-//! Splits the text of a DBC into statements and parses the usable ones.
+//! Splits the text of a DBC into statements and parses the usable statements.
 //!
 //! In: the text. Out: the syntax tree of the `can-dbc` crate, and a fault for each statement that was left out. A
-//! message definition (`BO_`) is one statement with its signals. If the text as a whole does not parse, each statement
-//! is parsed alone, so the time is proportional to the length of the text. Left-out statements become empty lines:
-//! line numbers do not change.
+//! message definition (`BO_`) and its signals form one statement. If the whole text does not parse, each statement is
+//! parsed alone, so that the time stays proportional to the text's length. Left-out statements become empty lines, so
+//! that line numbers do not change.
 
 use std::collections::HashSet;
 
 use super::DbcError;
 
-/// Maximum number of characters of a line that a fault quotes.
+/// Longest quoted text, in characters.
 const MAX_QUOTE: usize = 80;
 
-/// One statement with its line ends.
 struct Statement<'t> {
     /// Line of the first character, from 1.
     line: usize,
     text: &'t str,
 }
 
-/// Parses the statements that can be used. Adds a fault to `left_out` for each other statement. Returns whether every
-/// message has the form of a message, even if no frame can have its identifier.
-///
-/// # Errors
-/// The usable statements do not form a DBC together. The error is the first fault of the whole text.
+/// Parses the usable statements and adds a fault to `left_out` for every other statement. The returned flag is false if
+/// a statement does not follow the grammar; an invalid identifier does not count. If the usable statements do not form
+/// a DBC, returns the first fault of the whole text.
 pub(super) fn parse(text: &str, left_out: &mut Vec<DbcError>) -> Result<(can_dbc::Dbc, bool), DbcError> {
     let mut statements = split(text);
     leave_out_bad_identifiers(&mut statements, left_out);
@@ -42,7 +39,7 @@ pub(super) fn parse(text: &str, left_out: &mut Vec<DbcError>) -> Result<(can_dbc
     })
 }
 
-/// Splits the text before each line that begins with a keyword, such as `BO_`. `SG_` continues a `BO_` statement.
+/// Splits the text before each line that begins with a keyword, such as `BO_`.
 fn split(text: &str) -> Vec<Statement<'_>> {
     let mut statements = Vec::new();
     let (mut start, mut start_line, mut end) = (0, 1, 0);
@@ -57,7 +54,8 @@ fn split(text: &str) -> Vec<Statement<'_>> {
     statements
 }
 
-/// Whether a line begins with a keyword. The list of keywords after `NS_` is indented, with one keyword on a line.
+/// Whether a line begins with a keyword. Indented single keywords do not count, because the list after `NS_` consists
+/// of them.
 fn starts_statement(line: &str) -> bool {
     let word = line.trim_start().split([' ', '\t', ':', '\r', '\n']).next().unwrap_or_default();
     let is_keyword = word == "VERSION"
@@ -66,7 +64,7 @@ fn starts_statement(line: &str) -> bool {
     is_keyword && word != "SG_" && !is_listed
 }
 
-/// The text with empty lines in place of the statements that are not listed.
+/// Puts empty lines in place of removed statements.
 fn join(text: &str, statements: &[Statement<'_>]) -> String {
     let mut joined = String::with_capacity(text.len());
     let mut line = 1;
@@ -83,13 +81,13 @@ impl Statement<'_> {
         self.text.split([' ', '\t', ':', ';', '\r', '\n']).filter(|word| !word.is_empty())
     }
 
-    /// The number that identifies the message, as written, if the statement defines a message.
+    /// The identifier as written, if the statement defines a message.
     fn identifier(&self) -> Option<&str> {
         let mut words = self.words();
         if words.next() == Some("BO_") { words.next() } else { None }
     }
 
-    /// Whether the statement adds to the message with the given number, such as a comment or a value table.
+    /// Whether the statement defines or describes a message with one of these identifiers.
     fn adds_to(&self, identifiers: &HashSet<String>) -> bool {
         // The longest form is `BA_ "NAME" SG_ NUMBER`.
         self.words().take(4).skip(1).any(|word| identifiers.contains(word))
@@ -105,8 +103,8 @@ impl Statement<'_> {
     }
 }
 
-/// Removes messages with an identifier that no frame has, and the statements that add to these messages. The grammar
-/// crate would drop the higher bits of the identifier.
+/// Removes all statements about messages with an invalid identifier. The `can-dbc` crate would drop the identifier's
+/// upper bits, so that it could equal another identifier.
 fn leave_out_bad_identifiers(statements: &mut Vec<Statement<'_>>, left_out: &mut Vec<DbcError>) {
     let mut bad = HashSet::new();
     for statement in statements.iter() {
@@ -115,7 +113,7 @@ fn leave_out_bad_identifiers(statements: &mut Vec<Statement<'_>>, left_out: &mut
             Ok(id) if id & 0x8000_0000 == 0 => id > 0x7FF,
             // Editors mark the identifiers of pseudo messages with bit 30.
             Ok(id) => id > 0xFFFF_FFFF || id & 0x6000_0000 != 0 && !is_pseudo(statement),
-            // The grammar rejects text that is not a number.
+            // The number exceeds 64 bits. The grammar rejects text that is not a number.
             Err(_) => id.bytes().all(|b| b.is_ascii_digit()),
         };
         if !is_bad {
@@ -132,7 +130,6 @@ fn leave_out_bad_identifiers(statements: &mut Vec<Statement<'_>>, left_out: &mut
     }
 }
 
-/// Whether the statement defines the pseudo message in which editors keep signals without a message.
 fn is_pseudo(statement: &Statement<'_>) -> bool {
     statement.words().nth(2) == Some(super::PSEUDO_MESSAGE)
 }
@@ -140,7 +137,7 @@ fn is_pseudo(statement: &Statement<'_>) -> bool {
 fn grammar_fault(error: &can_dbc::DbcError) -> DbcError {
     match error {
         can_dbc::DbcError::Pest(error) => {
-            // The report's last line states what was expected; the lines before it show the position.
+            // The report's last line states what was expected.
             let report = error.to_string();
             let expected = report.lines().rev().find_map(|line| line.trim().strip_prefix("= "));
             let expected = match expected {
@@ -155,7 +152,7 @@ fn grammar_fault(error: &can_dbc::DbcError) -> DbcError {
     }
 }
 
-/// The line number in pest's report, which starts with ` --> line:column`.
+/// Line number in pest's report, which starts with ` --> line:column`.
 fn error_line(report: &str) -> usize {
     let place = report.lines().next().and_then(|first| first.split("--> ").nth(1));
     place.and_then(|place| place.split(':').next()).and_then(|line| line.trim().parse().ok()).unwrap_or(1)

@@ -1,5 +1,5 @@
-//! Tests that the parser reads complete DBC texts, that it leaves out faulty messages with a line number, and that it
-//! rejects texts without a usable message.
+//! Tests that the parser reads complete DBC texts, leaves out faulty messages with a line number, and rejects texts
+//! without a usable message.
 
 use super::*;
 
@@ -125,7 +125,7 @@ fn errors_state_their_line() {
     }
 }
 
-/// A text with a good message before and after `middle`.
+/// Parses a text with a valid message before and after `middle`, and checks both messages.
 fn between_good_messages(middle: &str) -> Database {
     let good = |id: u32, name: &str| format!("BO_ {id} {name}: 8 X\n SG_ V : 0|8@1+ (1,0) [0|0] \"V\" X\n\n");
     let text = format!("{}{middle}{}CM_ SG_ 2 V \"two\nlines\";\n", good(1, "First"), good(2, "Last"));
@@ -170,7 +170,7 @@ fn second_message_of_one_name_is_left_out() {
 
 #[test]
 fn details_of_left_out_message_reach_no_other_message() {
-    // The low 16 bits of the identifier are those of the message First.
+    // The low 16 bits of this identifier equal the identifier of the message First.
     let bad = format!("BO_ {} Bad: 8 X\n SG_ V : 0|8@1+ (1,0) [0|0] \"\" X\n", 0x10001);
     let db = between_good_messages(&format!("{bad}CM_ SG_ {} V \"wrong\";\n", 0x10001));
     assert_eq!(db.signal("First.V").unwrap().1.comment, None);

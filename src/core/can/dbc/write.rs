@@ -1,8 +1,7 @@
 //! Writes messages and signals as DBC text.
 //!
 //! In: a [`Database`]. Out: text that DBC tools load and that [`Database::parse`] parses to an equal database. Numbers
-//! are written with as many digits as they need and without an exponent. An attribute is defined only if a message has
-//! it.
+//! are written with all significant digits and without an exponent. An attribute is defined only if a message has it.
 
 use std::fmt::Write as _;
 
@@ -15,15 +14,14 @@ use super::{Database, FrameFormat, Message, MuxCondition, Signal};
 use crate::can::CanId;
 use crate::can::signal::{ByteOrder, ValueType};
 
-/// Placeholder for "no node".
 const NO_NODE: &str = "Vector__XXX";
 
 impl Database {
-    /// The text of the DBC. A signal's conditions must refer to multiplexors of its message, as after parsing.
+    /// The text of the DBC. A signal's conditions must refer to multiplexors of the same message.
     pub fn to_dbc(&self) -> String {
         let mut text = String::from("VERSION \"\"\n\nNS_ :\n\nBS_:\n\nBU_:");
         for node in &self.nodes {
-            // Writing to a String cannot fail, here and below.
+            // Writing to a `String` cannot fail.
             let _ = write!(text, " {node}");
         }
         text.push_str("\n\n");
@@ -41,12 +39,11 @@ impl Database {
         text
     }
 
-    /// The DBC as bytes: Latin-1, as DBC tools expect, or UTF-8 if Latin-1 cannot represent the text or if the Latin-1
-    /// bytes would be parsed as UTF-8.
+    /// The DBC as Latin-1, as DBC tools expect. UTF-8 is used if Latin-1 cannot represent the text or if its bytes
+    /// would be parsed as UTF-8.
     pub fn to_dbc_bytes(&self) -> Vec<u8> {
         let text = self.to_dbc();
         let latin: Option<Vec<u8>> = text.chars().map(|c| u8::try_from(c).ok()).collect();
-        // Latin-1 bytes that are also valid UTF-8 would be parsed as UTF-8.
         latin
             .filter(|bytes| text.is_ascii() || std::str::from_utf8(bytes).is_err())
             .unwrap_or_else(|| text.into_bytes())
@@ -88,9 +85,8 @@ impl Database {
             FrameFormat::Fd { brs } => Some(u8::from(brs).to_string()),
             FrameFormat::Classic => None,
         };
-        // Longest cycle time that the attribute allows: an hour, in ms.
+        // The cycle times allow up to one hour, in ms.
         let cycle_time = "INT 0 3600000";
-        // Largest number of repetitions that the attribute allows.
         let repetitions = "INT 0 999999";
         let word = |number: Option<u32>| number.map(|number| number.to_string());
         self.attribute(CYCLE_TIME, cycle_time, "0", |m| word(m.cycle_time_ms), text);
@@ -110,7 +106,7 @@ impl Database {
         }
     }
 
-    /// Defines an attribute and writes its values, if any message has a value.
+    /// Defines an attribute and writes its values. Writes nothing if no message has a value.
     fn attribute(
         &self,
         name: &str,
@@ -128,7 +124,7 @@ impl Database {
         }
     }
 
-    /// Writes an enumeration attribute; the first value is the default.
+    /// Writes an enumeration attribute. The first value is the default.
     fn choice(&self, name: &str, words: &[&str], value: impl Fn(&Message) -> Option<String>, text: &mut String) {
         let quoted: Vec<String> = words.iter().map(|word| format!("\"{word}\"")).collect();
         self.attribute(name, &format!("ENUM {}", quoted.join(",")), &quoted[0], value, text);
@@ -156,8 +152,8 @@ impl Database {
     }
 }
 
-/// The text with its quotes escaped. Parsed text already has escaped quotes. If the text ends with a backslash, appends
-/// a blank, because the backslash would escape the closing quote.
+/// Escapes quotation marks unless they are already escaped. Appends a blank to a text that ends with a backslash,
+/// because the backslash would escape the closing quotation mark.
 fn quoted(text: &str) -> String {
     let mut safe = String::with_capacity(text.len());
     for c in text.chars() {
@@ -213,8 +209,8 @@ fn indicator(signal: &Signal) -> String {
     }
 }
 
-/// Whether the message needs `SG_MUL_VAL_` lines because the indicators are not sufficient: it has ranges, nested
-/// multiplexors, or several multiplexors on the same level.
+/// Whether the message needs `SG_MUL_VAL_` lines. The indicators cannot express ranges of codes, nested multiplexors,
+/// or several top-level multiplexors.
 fn needs_ranges(message: &Message) -> bool {
     let mut conditions = message.signals.iter().map(|signal| signal.conditions.as_slice());
     let plain = message.signals.iter().filter(|signal| signal.is_multiplexor && signal.conditions.is_empty());

@@ -1,10 +1,11 @@
-//! Prepares bindings for decoding: groups them by message and page, and computes shifts, factors and limits per signal.
+//! Decodes frames with prepared tables: bindings by message and multiplexer page, with shift, factor and limits of each
+//! signal.
 //!
-//! In: frames. Out: readings. The good codes of a [`Binding`] are the raw codes with a valid value. They form a range,
-//! which is computed in advance. If "not available" codes split the range, its longest part is used. The binding itself
-//! decodes all other codes. The binding also decodes signals without such a range: floats, signals of 64 bits or
-//! spanning nine bytes, signals whose scale is 0 or not finite, and the direction of the current. If a selector has too many codes for a table, the
-//! first binding of each group decodes the selector.
+//! In: frames. Out: readings. For each signal, a range of raw codes with valid values is computed in advance: the good
+//! codes. The signal's [`Binding`] decodes all other codes. The binding also decodes signals without good codes:
+//! floats, signals of 64 bits or spanning nine bytes, signals whose scale is 0 or not finite, and the direction of the
+//! current. A page consists of the signals that are present with one code of the selector. If the selector has too many
+//! codes for a table of pages, the first binding of each group of signals decodes the selector.
 
 use std::hint::cold_path;
 use std::ops::Range;
@@ -16,10 +17,9 @@ use crate::can::signal::{ByteOrder, SignalPlan, ValueType, float_of_signed};
 use crate::can::{CanId, Frame};
 use crate::quantity::{BusIndex, Fault};
 
-/// Maximum number of codes of a selector that gets a table: ten bits. Selectors usually have 4 to 8 bits.
+/// Ten bits. Selectors usually have 4 to 8 bits.
 const MAX_CODES: u64 = 1024;
-/// Maximum number of entries in the page table of one message. Limits the memory if many signals have wide ranges of
-/// codes.
+/// Maximum number of entries in a page table. Limits the memory if many signals have wide ranges of codes.
 const MAX_GROUPS: usize = 1 << 16;
 
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -32,7 +32,6 @@ pub(super) struct MessageTable {
 struct MessageGroups {
     bus: BusIndex,
     id: CanId,
-    /// All groups of signals, in order.
     all: Vec<SignalGroup>,
     pages: Option<PageTable>,
 }
@@ -40,38 +39,37 @@ struct MessageGroups {
 /// Consecutive bindings with the same multiplexer conditions.
 #[derive(Debug, Clone, PartialEq)]
 struct SignalGroup {
-    /// The prepared bindings; pages share the list.
+    /// The prepared bindings. Pages share the list.
     signals: Arc<[LinearSignal]>,
-    /// Index of the group's first binding among all bindings.
+    /// Index among all bindings.
     first: usize,
-    /// A payload of at least this length carries all signals of the group. [`NEVER`] means that the first binding
-    /// decides whether the group is present.
+    /// A payload of at least this length (bytes) carries all signals. [`NEVER`] = the first binding decides whether the
+    /// group is present.
     bytes_needed: usize,
 }
 
-/// A length that is greater than the length of any payload, bytes.
 const NEVER: usize = usize::MAX;
 
-/// Lists the groups that may be present for each code of the selector.
+/// The groups that may be present for each code of the selector.
 #[derive(Debug, Clone, PartialEq)]
 struct PageTable {
     selector: BitPosition,
-    /// A payload of at least this length carries every selector of the message. For a shorter payload, the first
-    /// binding of each group decides whether the group is present.
+    /// A payload of at least this length (bytes) carries every selector. For a shorter payload, the first binding of
+    /// each group decides whether the group is present.
     bytes_needed: usize,
-    /// Range in `groups` for each code; the last entry is for all larger codes.
+    /// Range in `groups` for each code. The last entry is for all larger codes.
     codes: Vec<Range<usize>>,
     groups: Vec<SignalGroup>,
 }
 
-/// Number of words in [`PayloadWords::words`]. Word indices from this value up mark signals outside these words.
+/// Number of words in [`PayloadWords::words`]. A word index of at least [`FAR`] marks a signal outside these words.
 const FAR: u8 = 2;
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct BitPosition {
-    /// Index in [`PayloadWords::words`]; plus [`FAR`] for a signal outside these words.
+    /// Index in [`PayloadWords::words`]. For a signal outside these words: [`FAR`] (little-endian) or `FAR + 1`.
     word: u8,
-    /// First of the eight payload bytes that contain the signal.
+    /// First byte of the eight-byte window with the signal.
     window: u8,
     up: u8,
     down: u8,
@@ -85,15 +83,14 @@ impl BitPosition {
     }
 }
 
-/// Converts the good codes of one signal. The binding converts all other codes. The size is 64 bytes, one cache line.
+/// Converts the good codes of one signal. 64 bytes, one cache line.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct LinearSignal {
     channel: Channel,
     position: BitPosition,
-    /// The sign bit of a signed signal; 0 for an unsigned signal. `(code ^ sign) - sign` extends the sign.
+    /// Sign bit; 0 for an unsigned signal. `(code ^ sign) - sign` extends the sign.
     sign: u64,
-    /// Good codes are within the DBC's and the configured range. `first_good` is the first good code, with its sign bit
-    /// flipped; `more_good` is the number of codes after it.
+    /// First good code, with its sign bit flipped. `more_good` is the number of good codes after it.
     first_good: u64,
     more_good: u64,
     factor: f64,
@@ -102,15 +99,13 @@ struct LinearSignal {
     shift: f64,
 }
 
-/// The first bytes of a payload as words.
 struct PayloadWords<'a> {
     frame: &'a Frame,
-    /// The first eight bytes, padded with zeros: little-endian and big-endian.
+    /// The first eight bytes, padded with zeros, as a little-endian and a big-endian word.
     words: [u64; FAR as usize],
 }
 
 impl<'a> PayloadWords<'a> {
-    /// Loads the first eight payload bytes of a frame.
     #[inline(always)]
     fn new(frame: &'a Frame) -> Self {
         let word = frame.padded_data().first_chunk().map_or(0, |bytes| u64::from_le_bytes(*bytes));
@@ -122,7 +117,7 @@ impl<'a> PayloadWords<'a> {
         self.frame.len() >= bytes
     }
 
-    /// The bits at a position, shifted down to bit 0.
+    /// The bits at a position, shifted to bit 0.
     #[inline(always)]
     fn bits(&self, position: &BitPosition) -> u64 {
         let word = match self.words.get(usize::from(position.word)) {
@@ -135,11 +130,9 @@ impl<'a> PayloadWords<'a> {
         word << (position.up & 63) >> (position.down & 63)
     }
 
-    /// The word of a signal outside the first eight bytes.
     #[inline(always)]
     fn far_word(&self, position: &BitPosition) -> u64 {
         let from = usize::from(position.window);
-        // The window of a signal lies within the longest payload.
         let bytes = self.frame.padded_data().get(from..).and_then(|rest| rest.first_chunk());
         let word = bytes.map_or(0, |bytes| u64::from_le_bytes(*bytes));
         if position.word == FAR { word } else { word.swap_bytes() }
@@ -165,7 +158,6 @@ impl MessageTable {
         self.messages.iter().map(|message| (message.bus, message.id, message.all.len()))
     }
 
-    /// See [`super::InputMap::decode`].
     #[inline]
     pub(super) fn decode(&self, bindings: &[Binding], bus: BusIndex, frame: &Frame, mut each: impl FnMut(Reading)) {
         let Some(message) = self.messages.get(self.indices.number(bus, frame.id())) else { return };
@@ -177,7 +169,7 @@ impl MessageTable {
                 continue;
             }
             for (n, plan) in group.signals.iter().enumerate() {
-                // Call `each` separately for good and bad values: a good value then stays in a register.
+                // Separate calls for good and bad values keep a good value in a register.
                 match plan.good(&words) {
                     Some(value) => each(Reading { channel: plan.channel, value: Ok(value) }),
                     None => {
@@ -191,14 +183,13 @@ impl MessageTable {
     }
 }
 
-/// Decodes a signal that is present.
 #[cold]
 #[inline(never)]
 fn value_of(binding: &Binding, payload: &[u8]) -> Result<f64, Fault> {
     binding.value(payload)
 }
 
-/// Decodes the bindings of a group, if the group is present. If a selector is missing, every binding gives a fault.
+/// Decodes a group if it is present. If a selector is missing, every binding gives a fault.
 fn decode_one_by_one(bindings: &[Binding], payload: &[u8], each: &mut impl FnMut(Reading)) {
     let present = bindings.first().map_or(Ok(false), |first| first.holds(payload));
     if present == Ok(false) {
@@ -218,7 +209,6 @@ impl SignalGroup {
         Self { signals: bindings.iter().map(LinearSignal::new).collect(), first: run.start, bytes_needed }
     }
 
-    /// The same group, but its first binding decides whether the group is present.
     fn with_presence_check(&self) -> Self {
         Self { bytes_needed: NEVER, ..self.clone() }
     }
@@ -247,9 +237,8 @@ impl MessageGroups {
 }
 
 impl PageTable {
-    /// Creates the table for the selector on which most groups depend. `runs` are the ranges of the groups' bindings,
-    /// `all` are the groups. `None` = no selector, a selector that is not a simple integer, or a table that would be
-    /// too large.
+    /// Creates the table for the selector on which most groups depend. `runs` are the binding ranges of the groups in
+    /// `all`. `None` = there is no selector, the selector is not a simple integer, or the table would be too large.
     fn new(bindings: &[Binding], runs: &[Range<usize>], all: &[SignalGroup]) -> Option<Self> {
         let tests = |run: &Range<usize>| bindings[run.start].mux.as_slice();
         let dependents = |plan: SignalPlan| runs.iter().flat_map(tests).filter(|test| test.plan == plan).count();
@@ -265,7 +254,7 @@ impl PageTable {
             codes: Vec::new(),
             groups: Vec::new(),
         };
-        // The last code stands for all larger codes, which no range contains.
+        // The last entry is for all larger codes, which no range contains.
         for code in 0..=codes {
             let start = pages.groups.len();
             for (run, group) in runs.iter().zip(all) {
@@ -292,7 +281,7 @@ impl PageTable {
     }
 }
 
-/// Whether a group with these conditions may be present if the selector has this code.
+/// Whether the selector's code allows a group with these conditions.
 fn may_hold(selector: SignalPlan, tests: &[MuxTest], code: u64) -> bool {
     tests.iter().filter(|test| test.plan == selector).all(|test| test.allows(code))
 }
@@ -302,7 +291,7 @@ impl LinearSignal {
         let Binding { channel, scale, offset: shift, .. } = *binding;
         let never_good = Self {
             channel,
-            // An arbitrary position of one bit, because no code is good.
+            // Any position works, because no code is good.
             position: BitPosition { word: 0, window: 0, up: 0, down: 63 },
             sign: 0,
             first_good: u64::MAX,
@@ -332,7 +321,7 @@ impl LinearSignal {
         }
     }
 
-    /// The value in the program's unit and sign; `None` = the code is not good. The payload must carry the signal.
+    /// The value in the program's unit and sign; `None` = not a good code. The payload must carry the signal.
     #[inline(always)]
     fn good(&self, words: &PayloadWords<'_>) -> Option<f64> {
         let flipped = words.bits(&self.position) ^ self.sign;
@@ -342,8 +331,8 @@ impl LinearSignal {
     }
 }
 
-/// The longest run of good codes without a "not available" code. "Not available" codes are nearly always at the ends of
-/// the range. If such a code is in the middle, the binding decodes the shorter part.
+/// The longest run of good codes without a "not available" code. Usually this is the whole range, because "not
+/// available" codes are mostly at its ends.
 fn available_codes(binding: &Binding, sign: u64, (first, last): (i64, i64)) -> Option<(i64, i64)> {
     let possible = binding.not_available.iter().filter(|code| **code <= binding.plan.all_ones());
     let signed = possible.map(|code| (code ^ sign).wrapping_sub(sign).cast_signed());
@@ -355,9 +344,8 @@ fn available_codes(binding: &Binding, sign: u64, (first, last): (i64, i64)) -> O
     begins.zip(ends).filter(|(begin, end)| begin <= end).max_by_key(|(begin, end)| begin.abs_diff(*end))
 }
 
-/// The first and the last code whose value is in the DBC's range and in the configured range. Every step from code to
-/// value is monotonic, rounding included. Therefore the good codes are consecutive, and bisection finds their ends
-/// exactly.
+/// The first and the last code with a value in both the DBC's range and the configured range. Bisection finds these
+/// codes exactly, because every step from code to value is monotonic, rounding included.
 fn good_codes(binding: &Binding) -> Option<(i64, i64)> {
     let plan = &binding.plan;
     let physical = |code: i64| float_of_signed(code) * plan.factor + plan.offset;
@@ -368,7 +356,7 @@ fn good_codes(binding: &Binding) -> Option<(i64, i64)> {
     type Map<'a> = &'a dyn Fn(i64) -> f64;
     let both: [(Map<'_>, f64, f64); 2] = [(&physical, plan.low, plan.high), (&value, binding.range.0, binding.range.1)];
     for (of, low, high) in both {
-        // With rising values: the first code not below the lower limit, and the first above the upper limit.
+        // For rising values: the first code at or above the lower limit, and the first code above the upper limit.
         let (first, end) = if is_rising(of) {
             (first_where(good, |code| of(code) >= low), first_where(good, |code| of(code) > high))
         } else {
@@ -382,8 +370,7 @@ fn good_codes(binding: &Binding) -> Option<(i64, i64)> {
     Some(good)
 }
 
-/// The first code that satisfies a predicate; `None` = no code does. If a code satisfies the predicate, all later codes
-/// must satisfy it, too.
+/// The first code that satisfies a predicate; all later codes must satisfy it, too.
 fn first_where((mut low, mut high): (i64, i64), holds: impl Fn(i64) -> bool) -> Option<i64> {
     if !holds(high) {
         return None;

@@ -1,22 +1,22 @@
 //! Finds the configured message of a J1939 frame by its parameter group.
 //!
-//! A DBC gives one identifier, with one source address, to a parameter group. On the bus, the source address is the one
-//! that the sender has claimed. Such a frame is therefore handled as a frame with the configured identifier. If several
-//! configured messages belong to one group, each is found by its own identifier only. The same holds for groups with a
-//! destination, such as EF00, which any node uses for its own purposes.
+//! A DBC gives a parameter group one identifier, which includes a source address. On the bus, a frame has the source
+//! address that its sender has claimed. The frame is therefore handled as a frame with the configured identifier.
+//! Exceptions are groups with several configured messages, and groups with a destination address, such as EF00, which
+//! any node uses for its own purposes.
 //!
-//! Several packs on one bus send the same groups. The frames of one of them are used ([`GroupSenders`]). A sender may lose
-//! its address to another node and claim a new one.
+//! If several packs on one bus send the same group, only the frames of one pack are used ([`GroupSenders`]).
 
 use super::Binding;
 use crate::can::j1939::{any_source, has_destination, parameter_group};
 use crate::can::{CanId, Frame};
 use crate::quantity::{BusIndex, Timestamp};
 
-/// Time without a frame after which another sender of a group is used (s): five frames of the slowest usual group.
+/// If the sender of a group is silent for this time (s), another sender is used. The slowest usual group sends five
+/// frames in this time.
 const SILENT_S: f64 = 5.0;
 
-/// The configured identifier of each parameter group that frames of any source address carry.
+/// Configured identifiers of the parameter groups that are accepted from any source address.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct ParameterGroups {
     /// Interface, parameter group number, configured identifier; sorted.
@@ -40,7 +40,7 @@ impl ParameterGroups {
         Self { groups: alone.collect() }
     }
 
-    /// Finds the configured message that a frame carries, which was received at `now`.
+    /// Finds the configured message of a frame received at `now`.
     #[inline]
     pub fn configured(&self, now: Timestamp, bus: BusIndex, frame: &Frame, senders: &mut GroupSenders) -> GroupFrame {
         if self.groups.is_empty() {
@@ -59,12 +59,12 @@ impl ParameterGroups {
         Some(self.groups[place].2)
     }
 
-    /// Whether frames of any source address carry this configured message.
+    /// Whether this configured message is accepted from any source address.
     pub fn has_any_source(&self, bus: BusIndex, id: CanId) -> bool {
         self.find(bus, id) == Some(id)
     }
 
-    /// Identifiers and masks of the extended frames that an interface must receive.
+    /// Identifiers and masks of the extended frames to receive.
     pub fn patterns(&self, bus: BusIndex) -> impl Iterator<Item = (u32, u32)> + '_ {
         self.groups.iter().filter(move |group| group.0 == bus).map(|group| any_source(group.1))
     }
@@ -73,17 +73,18 @@ impl ParameterGroups {
 /// A received frame, compared with the configured groups.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum GroupFrame {
-    /// The frame belongs to no group and keeps its identifier.
+    /// The frame does not belong to a configured group and keeps its identifier.
     Other,
     /// The frame with the identifier of the configured message.
     Configured(Frame),
-    /// The frame has a configured group, but another sender is used.
+    /// The frame belongs to a configured group, but its sender is not used.
     OfAnotherSender,
 }
 
-/// The sender that is used for each group: the configured source address as soon as it sends, until then the first
-/// address that sends the group. If the sender is silent for 5 s, an address that was not heard before replaces it. An
-/// address that was heard besides the sender belongs to another node. A restart begins anew.
+/// The sender that is used for each group. It is the first address that sends the group, or the configured source
+/// address as soon as this address sends the group. If the sender is silent for 5 s, for example because it claimed a
+/// new address, an address that was never heard before replaces it. An address that was heard besides the sender
+/// belongs to another node.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct GroupSenders {
     chosen: Vec<ChosenSender>,
@@ -92,7 +93,6 @@ pub struct GroupSenders {
 #[derive(Debug, Clone, PartialEq)]
 struct ChosenSender {
     bus: BusIndex,
-    /// Identifier of the configured message.
     configured: CanId,
     source: u8,
     latest: Timestamp,
@@ -155,7 +155,7 @@ mod tests {
             matches!(found, GroupFrame::Configured(_))
         };
         let [a, b, c, d, later, configured] = [0xF3, 0xF4, 0x80, 0x81, 0x82, 0xFE].map(|source| 0x18FF_5000 + source);
-        // The first sender is used until it is silent or the configured one sends.
+        // The first sender is used until it is silent for 5 s, or until the configured address sends.
         assert_eq!([(0.0, a), (1.0, b), (2.0, a), (6.9, c)].map(&mut is_used), [true, false, true, false]);
         assert_eq!([(8.0, b), (8.1, c)].map(&mut is_used), [false, false], "other nodes that were heard before");
         assert_eq!([(8.2, d), (8.3, a)].map(&mut is_used), [true, false], "the sender has claimed a new address");
@@ -172,7 +172,7 @@ mod tests {
         for sent in [CanId::Extended(0x18FF_51F4), CanId::Extended(0x19FF_50F4), CanId::Standard(0x4FE)] {
             assert_eq!(found(std::slice::from_ref(&any), sent), None, "{sent}");
         }
-        // Any node uses the group EF00 with a destination for its own purposes.
+        // Any node may use the group EF00.
         assert_eq!(found(&[message(0x18EF_21FE, true)], CanId::Extended(0x18EF_21F4)), None);
     }
 

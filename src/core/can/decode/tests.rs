@@ -7,8 +7,8 @@ use crate::can::dbc::Database;
 use crate::can::signal::{ByteOrder, SignalLayout, ValueType};
 use crate::quantity::CellIndex;
 
-/// Three messages. The first message is plain, with the voltage first and the current last. The second message is
-/// multiplexed, with one signal on every page. The third message has nested pages.
+/// A plain message with the voltage first and the current last, a multiplexed message with one signal on every page,
+/// and a message with nested pages.
 pub(crate) const DBC: &str = r#"VERSION ""
 BU_: BMS
 BO_ 256 Pack: 6 BMS
@@ -36,7 +36,6 @@ SIG_VALTYPE_ 2147483905 Wide : 1;
 VAL_ 256 Temperature 255 "not available" ;
 "#;
 
-/// Binds `name` on interface 0.
 pub(crate) fn bind(name: &str, channel: Channel) -> Binding {
     let dbc = Database::parse(DBC).unwrap();
     let (message, signal) = dbc.signal(name).unwrap();
@@ -51,7 +50,7 @@ pub(crate) const fn sensor(n: u16) -> Channel {
     Channel::Temperature(SensorIndex(n))
 }
 
-/// The first two messages, bound in no particular order. On the bus, the current is positive for charging.
+/// The first two messages. On the bus, the current is positive for charging.
 pub(crate) fn map() -> InputMap {
     InputMap::new(vec![
         bind("Cells.Cell3", cell(2)),
@@ -64,7 +63,7 @@ pub(crate) fn map() -> InputMap {
     ])
 }
 
-/// The third message.
+/// The message with nested pages.
 pub(crate) fn nested() -> InputMap {
     InputMap::new(vec![
         bind("Nested.Deep", cell(0)),
@@ -104,7 +103,7 @@ fn readings_are_ordered_current_temperature_voltage() {
 
 #[test]
 fn interleaved_pages_keep_channel_order() {
-    // Channels alternate between the pages, so that the signals of a page are not consecutive.
+    // The signals of a page are not consecutive.
     let found = InputMap::new(vec![
         bind("Cells.Cell1", cell(0)),
         bind("Cells.Cell3", cell(1)),
@@ -149,7 +148,7 @@ fn short_frame_affects_only_missing_signals() {
     let short = Err(Fault::ShortFrame);
     assert_eq!(values(&[0, 0x10, 0x0E]), [short, Ok(3.6), short]);
     assert_eq!(values(&[1, 0x10]), [short, short]);
-    // Without the selector, the page is unknown: all signals are short.
+    // Without the selector, the page is unknown, so all signals give a fault.
     assert_eq!(values(&[]), [short; 4]);
     assert_eq!(
         values(&[0, 0x10, 0x0E, 0x11, 0x0E, 0, 0, 0xFF]),
@@ -251,7 +250,7 @@ fn identifiers_and_channels_are_unique_and_sorted() {
     assert_eq!(map().channels(), all);
 }
 
-/// Signals of every type and position. Each message has several signals, and some signals are multiplexed.
+/// Signals of every type and position. Some are multiplexed.
 fn any_bindings() -> impl Strategy<Value = Vec<Binding>> {
     let order = prop::sample::select(vec![ByteOrder::LittleEndian, ByteOrder::BigEndian]);
     let kind = prop_oneof![
@@ -305,7 +304,7 @@ fn any_bindings() -> impl Strategy<Value = Vec<Binding>> {
     })
 }
 
-/// Reference decoder: decodes every binding of the message separately.
+/// Reference decoder: decodes every binding separately.
 fn decode_plainly(map: &InputMap, bus: BusIndex, frame: &Frame, mut each: impl FnMut(Reading)) {
     for binding in map.bindings().iter().filter(|binding| (binding.bus, binding.id) == (bus, frame.id())) {
         let value = match binding.holds(frame.data()) {

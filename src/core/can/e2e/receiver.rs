@@ -1,5 +1,5 @@
-//! The receiver of one protected message: E2E_P01Check of AUTOSAR. It is called once per frame, and once for each
-//! period without a frame.
+//! The receiver of one protected message: E2E_P01Check of AUTOSAR, called once per frame and once for each period
+//! without a frame.
 //!
 //! In: payloads in order of arrival. Out: a [`Status`] for each payload, and counts by status.
 //!
@@ -7,36 +7,35 @@
 //!
 //! * WaitForFirstData: `last_valid` is `None`.
 //! * LastValidCounter: counter of the last accepted frame.
-//! * MaxDeltaCounter: largest allowed counter step. It grows by one with each call, because each call may stand for a
+//! * MaxDeltaCounter: largest allowed counter step. Each call increases it by one, because the call may stand for a
 //!   lost frame. An accepted frame resets it.
-//! * NoNewOrRepeatedDataCounter: number of periods without a frame and of repeated frames since the frames' counter
-//!   last changed. Damaged frames do not count.
+//! * NoNewOrRepeatedDataCounter: number of periods without a frame and of repeated frames since the counter in the
+//!   frames last changed. Damaged frames do not count.
 //! * SyncCounter: number of valid frames still required before a broken sequence is trusted again.
 
 use serde::{Deserialize, Serialize};
 
 use super::{Profile, Protection};
 
-/// Limit of NoNewOrRepeatedDataCounter, as in AUTOSAR: a `max_no_new_or_repeated_data` of 14 allows any number.
+/// AUTOSAR's limit of NoNewOrRepeatedDataCounter.
 const MAX_REPEATED: u8 = 14;
 
 /// Settings of the check of one message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct CheckConfig {
-    /// Profile and data identifier.
     pub protection: Protection,
     /// Number of frames that may be lost between two accepted frames. Each call without an accepted frame allows one
-    /// more lost frame.
+    /// more.
     pub max_delta_counter_init: u8,
-    /// Maximum number of periods without a frame and of repeated frames since the frames' counter last changed. With
-    /// more, the sequence is broken. 14 = any number.
+    /// Maximum number of periods without a frame and of repeated frames since the counter last changed. Above this
+    /// number, the sequence is broken. 14 = any number.
     pub max_no_new_or_repeated_data: u8,
-    /// Number of valid frames required after a broken sequence; each has the status [`Status::Sync`].
+    /// Number of valid frames required after a broken sequence.
     pub sync_counter_init: u8,
 }
 
 impl CheckConfig {
-    /// Default settings: one frame may be lost, repetitions do not break the sequence, a broken sequence is trusted
+    /// Default settings: one frame may be lost, repetitions do not break the sequence, and a broken sequence is trusted
     /// again at once.
     pub const fn new(protection: Protection) -> Self {
         Self { protection, max_delta_counter_init: 1, max_no_new_or_repeated_data: MAX_REPEATED, sync_counter_init: 0 }
@@ -48,21 +47,21 @@ impl CheckConfig {
 #[serde(rename_all = "snake_case")]
 #[repr(u8)]
 pub enum Status {
-    /// The frame is intact, and it is the next frame in sequence.
+    /// The next frame in sequence.
     Ok = 0,
     /// No frame arrived within its period.
     NoNewData = 1,
-    /// The frame is damaged, too short, from another message, or has an invalid counter.
+    /// Damaged, too short, from another message, or with an invalid counter.
     WrongCrc = 2,
-    /// The frame is intact and in sequence, but it is one of the frames required after a broken sequence.
+    /// In sequence, but one of the frames required after a broken sequence.
     Sync = 3,
-    /// The frame is the first intact frame, so there is no previous counter to compare with.
+    /// The first intact frame. There is no previous counter to compare with.
     Initial = 4,
-    /// The frame is intact, but has the same counter as the last accepted frame.
+    /// The same counter as in the last accepted frame.
     Repeated = 5,
-    /// The frame is intact. Some frames before it were lost, but no more than allowed.
+    /// Frames were lost, but no more than allowed.
     OkSomeLost = 6,
-    /// The frame is intact, but the counter jumped further than allowed.
+    /// The counter jumped further than allowed.
     WrongSequence = 7,
 }
 
@@ -79,7 +78,7 @@ impl Status {
         Self::WrongSequence,
     ];
 
-    /// Whether the payload may be used, according to AUTOSAR's mapping with profile behaviour 1.
+    /// Whether the payload may be used (AUTOSAR's mapping with profile behaviour 1).
     pub const fn is_usable(self) -> bool {
         match self {
             Self::Ok | Self::OkSomeLost | Self::Sync => true,
@@ -112,7 +111,7 @@ impl StatusCounts {
         self.0[status as usize]
     }
 
-    /// Every status with its count, including zeros.
+    /// Every status with its count.
     pub fn iter(&self) -> impl Iterator<Item = (Status, u64)> + '_ {
         Status::ALL.into_iter().map(|status| (status, self.get(status)))
     }
@@ -127,23 +126,20 @@ impl StatusCounts {
     }
 }
 
-/// State of one message's receiver. Its counts are stored separately.
+/// State of one message's receiver. The counts are stored separately.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Receiver {
-    /// Counter of the last accepted frame; `None` = no accepted frame yet.
     last_valid: Option<u8>,
-    /// Largest allowed counter step. Each call first adds one, then compares.
+    /// Largest allowed counter step. Each call adds one before the comparison.
     max_delta: u8,
-    /// Number of periods without a frame and of repeated frames since the frames' counter last changed.
     no_new_or_repeated: u8,
-    /// Number of valid frames still required.
     sync: u8,
     #[serde(skip)]
     counts: StatusCounts,
 }
 
 impl Receiver {
-    /// Checks one frame's payload.
+    /// Checks the payload of a frame.
     pub fn check(&mut self, config: &CheckConfig, payload: &[u8]) -> Status {
         self.grow(config.protection.profile, 1);
         let status = match config.protection.verified_counter(payload) {
@@ -162,7 +158,7 @@ impl Receiver {
         Status::NoNewData
     }
 
-    /// Creates a receiver that waits for its first frame, with these counts.
+    /// A receiver that waits for its first frame, with these counts.
     pub(crate) fn with_counts(counts: StatusCounts) -> Self {
         Self { counts, ..Self::default() }
     }
@@ -187,7 +183,6 @@ impl Receiver {
         &self.counts
     }
 
-    /// Increases the allowed step, because each call may stand for a lost frame.
     fn grow(&mut self, profile: Profile, calls: u64) {
         self.max_delta = grown(self.max_delta, calls, profile.max_counter());
     }
@@ -196,7 +191,7 @@ impl Receiver {
         self.no_new_or_repeated = grown(self.no_new_or_repeated, calls, MAX_REPEATED);
     }
 
-    /// Handles an intact frame with this counter.
+    /// Handles an intact frame.
     fn take(&mut self, config: &CheckConfig, counter: u8) -> Status {
         let Some(last) = self.last_valid else {
             self.accept(config, counter);
@@ -210,9 +205,8 @@ impl Receiver {
         if delta > self.max_delta {
             self.no_new_or_repeated = 0;
             self.sync = config.sync_counter_init;
-            // With profile 5 or a configured synchronisation, the sequence continues from any intact frame. With
-            // profile 1 and no synchronisation, the last accepted counter stays. The sender must reach it again, or the
-            // allowed step must become large enough.
+            // With profile 5 or a configured synchronisation, the sequence continues from any intact frame. Otherwise,
+            // the last accepted counter stays until the sender reaches it again or the allowed step is large enough.
             if self.sync > 0 || config.protection.profile == Profile::P05 {
                 self.accept(config, counter);
             }
@@ -231,7 +225,7 @@ impl Receiver {
         self.max_delta = config.max_delta_counter_init;
     }
 
-    /// Whether this frame is one of the frames required after a broken sequence. The frame must be in sequence.
+    /// Counts a frame in sequence. Returns whether it is one of the frames required after a broken sequence.
     fn synchronise(&mut self, config: &CheckConfig) -> bool {
         if self.no_new_or_repeated > config.max_no_new_or_repeated_data {
             self.sync = config.sync_counter_init;
@@ -243,7 +237,6 @@ impl Receiver {
     }
 }
 
-/// Returns `from + by`, but at most `limit`.
 fn grown(from: u8, by: u64, limit: u8) -> u8 {
     from.saturating_add(u8::try_from(by).unwrap_or(u8::MAX)).min(limit)
 }

@@ -18,7 +18,7 @@ fn protected(profile: Profile, data_id: u16, payload: &[u8], counter: u8) -> Vec
 fn crcs_match_published_check_values() {
     assert_eq!(crc8(0, b"123456789"), 0x37);
     assert_eq!(crc16(0xFFFF, b"123456789"), 0x29B1);
-    // The library's CRC-8 SAE J1850 starts from 0xFF and inverts its result.
+    // AUTOSAR's CRC-8 SAE J1850 starts from 0xFF and inverts its result.
     assert_eq!(crc8(0xFF, b"123456789") ^ 0xFF, 0x4B);
 }
 
@@ -118,8 +118,7 @@ fn header_mask_covers_bytes_written_by_protect() {
     }
 }
 
-/// Flips every combination of `wrong_bits` bits of a payload. Returns the number of combinations that pass the check
-/// and the number of combinations tried.
+/// Flips every combination of `wrong_bits` bits. Returns how many combinations pass the check, and how many were tried.
 fn undetected(protection: Protection, payload: &[u8], counter: u8, wrong_bits: usize) -> (usize, usize) {
     let mut payload = payload.to_vec();
     protection.protect(&mut payload, counter).unwrap();
@@ -130,8 +129,8 @@ fn undetected(protection: Protection, payload: &[u8], counter: u8, wrong_bits: u
         missed += usize::from(protection.verified_counter(&payload).is_some());
         tried += 1;
         flip(&mut payload);
-        // Makes the next combination in ascending order: moves up the last bit that can move, and places the bits above
-        // it directly after it.
+        // Next combination in ascending order: move up the last bit that can move, and place all higher bits directly
+        // after it.
         let last = 8 * payload.len() - wrong_bits;
         let Some(place) = (0..wrong_bits).rfind(|place| chosen[*place] < last + place) else { break };
         let first = chosen[place] + 1;

@@ -1,9 +1,8 @@
-//! Decodes the command frame, with which another ECU acknowledges or clears alarms, or reports that the pack was
+//! Decodes the command frame. Another ECU sends it to acknowledge or clear alarms, or to report that the pack was
 //! replaced.
 //!
-//! In: a frame whose end-to-end protection or authenticator the caller has checked. Out: the command; a selector (rule,
-//! severity or cell) is `None` if it selects all alarms. An undefined code is an error, so that a command is applied
-//! completely or not at all.
+//! In: a frame whose end-to-end protection or authenticator the caller has checked. Out: the command and its selectors
+//! (rule, severity, cell). An undefined code is an error, so that a command is applied completely or not at all.
 
 use super::layout::LayoutMessage;
 use super::message::{PlanFaults, RULES};
@@ -17,24 +16,23 @@ use crate::quantity::{CellIndex, MAX_CELLS};
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Command {
     Acknowledge,
-    /// Clears latched alarms whose value is not beyond the threshold, and forgets the history of past alarms.
+    /// Clears latched alarms whose value is not beyond the threshold, and the history of past alarms.
     Clear,
     /// Reports that another pack is in the vehicle.
     PackReplaced,
 }
 
-/// A command and the alarms that it selects. A selector that is `None` does not restrict the selection.
+/// A command and the alarms that it selects. `None` does not restrict the selection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct CommandFields {
     pub command: Command,
-    /// Number of the rule.
     pub rule: Option<u8>,
     /// Wire code of the severity: 1 info, 2 warning, 3 severe.
     pub severity: Option<u8>,
     pub cell: Option<CellIndex>,
 }
 
-/// Reason why a frame is not a command.
+/// Why a frame is not a command.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{0}")]
 pub struct CommandFault(String);
@@ -64,10 +62,7 @@ struct SelectorSignal {
 }
 
 impl CommandPlan {
-    /// Finds the message and its signals.
-    ///
-    /// # Errors
-    /// Every message or signal that is missing or cannot be decoded, by name.
+    /// Finds the message and its signals, or names every message or signal that is missing or cannot be decoded.
     pub fn new(database: &Database) -> Result<Self, PlanFaults> {
         let name = LayoutMessage::Command.message();
         let message = database.message(name).ok_or_else(|| PlanFaults(vec![format!("message {name} is missing")]))?;
@@ -101,10 +96,8 @@ impl CommandPlan {
         self.secoc
     }
 
-    /// Decodes a command. Checks neither protection nor authenticator.
-    ///
-    /// # Errors
-    /// The frame is another message, is too short, or has an undefined code.
+    /// Decodes a command. Checks neither protection nor authenticator. Fails if the frame is another message, is too
+    /// short, or has an undefined code.
     pub fn decode(&self, frame: &Frame) -> Result<CommandFields, CommandFault> {
         if frame.id() != self.id || frame.kind() == FrameKind::Remote {
             return Err(CommandFault("is not the command message".to_owned()));
@@ -113,7 +106,7 @@ impl CommandPlan {
         if payload.len() < self.len {
             return Err(CommandFault(format!("has {} bytes, must have {}", payload.len(), self.len)));
         }
-        // Every signal lies within the message, so decoding cannot fail here.
+        // Every signal lies within the message, so `raw` cannot fail.
         let command = match self.command.raw(payload).unwrap_or(0) {
             1 => Command::Acknowledge,
             2 => Command::Clear,
@@ -155,7 +148,7 @@ impl SelectorSignal {
     }
 }
 
-/// Finds a signal that is always present, and the code of "all" in its value table.
+/// Finds a signal and the code of "all" in its value table. The signal must not be multiplexed.
 fn signal(message: &Message, name: &str, faults: &mut Vec<String>) -> Option<(SignalPlan, Option<u64>)> {
     let mut fault = |what: String| faults.push(format!("signal {}.{name}{what}", message.name));
     let Some(signal) = message.signal(name) else {
@@ -184,7 +177,7 @@ mod tests {
         CommandPlan::new(&layout(LayoutBase::BuiltIn { rated_capacity_ah: 2.6 }, &settings).unwrap()).unwrap()
     }
 
-    /// Codes of command, rule, severity and cell in a frame.
+    /// Codes: command, rule, severity, cell.
     fn frame(codes: [u64; 4]) -> Frame {
         let bits = codes[0] << 16 | codes[1] << 20 | codes[2] << 25 | codes[3] << 27;
         Frame::classic(CanId::Standard(1715), &bits.to_le_bytes()).unwrap()

@@ -1,15 +1,14 @@
 //! Encodes channel values as input frames, for CSV replay and the simulator.
 //!
-//! In: rows; a row lists channels with their values at one moment. Out: frames. Each message and multiplexer page with
-//! at least one value gives one frame. In that frame, a signal without a value is encoded as its "not available" code.
-//! If the signal has no such code, it is encoded as a code that the receiver rejects (NaN, out of range). If no such
-//! code exists, the whole frame is omitted, and its values count as not carried. A frame without any value is sent only
-//! if one of its signals has a "not available" code and the row contains this signal's channel. Values beyond the
+//! In: rows; a row lists channels with their values at one moment. Out: frames. Each message or multiplexer page with
+//! at least one value gives one frame. A missing value is encoded as the signal's "not available" code, or as a code
+//! that the receiver rejects (NaN, out of range). If neither exists, the frame is omitted and its values count as not
+//! carried. A channel without a value causes a frame only if its signal has a "not available" code. Values beyond the
 //! signal's bits saturate. Values outside the DBC's range stay outside, so that the receiver detects the fault. A
-//! diagnostic response is encoded with its request and flow control, as on a bus with a tester.
+//! diagnostic response is encoded with its request and flow control.
 //!
-//! The rows of a log usually have the same channels in the same order. Therefore the encoder finds the position of each
-//! signal's value in a row once and keeps it until the channels change.
+//! The rows of a log usually have the same channels in the same order. Therefore, the position of each signal's value
+//! is stored until the channels change.
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;
@@ -21,7 +20,7 @@ use crate::can::uds::{Answer, AnswerSignal, Controller, Question};
 use crate::can::{CanId, Frame, MAX_DATA};
 use crate::quantity::BusIndex;
 
-/// Largest code that is tried as a direction of the current. Directions are bits or bytes.
+/// Largest code that is tried as a direction of the current. Direction signals have at most two bytes.
 const MAX_DIRECTION_CODE: u64 = 0xFFFF;
 
 /// Encodes values as input frames.
@@ -29,19 +28,16 @@ const MAX_DIRECTION_CODE: u64 = 0xFFFF;
 pub struct InputEncoder {
     pages: Vec<InputPage>,
     answers: Vec<AnswerPage>,
-    /// Positions of the values in the last row.
     places: RefCell<RowPlaces>,
 }
 
-/// Positions of the fields' values in a row.
 #[derive(Debug, Clone, Default)]
 struct RowPlaces {
     channels: Vec<RowChannel>,
-    /// Position of each field's value, by the field's number; `None` = the row does not have the channel.
+    /// Indexed by the field's number; `None` = the row does not have the channel.
     of_fields: Vec<Option<usize>>,
 }
 
-/// A row of values, with the positions of the fields' values.
 #[derive(Clone, Copy)]
 struct PlacedRow<'a> {
     values: &'a [(Channel, Option<f64>)],
@@ -51,22 +47,22 @@ struct PlacedRow<'a> {
 #[derive(Debug, Clone, Copy)]
 struct RowChannel {
     channel: Channel,
-    /// Whether a later position has the same channel. The later value counts.
+    /// Whether the channel occurs again later in the row. The last value counts.
     is_overridden: bool,
-    /// Whether a frame carries the value of the row that is being encoded.
+    /// Whether a frame carries the channel's value.
     is_carried: bool,
 }
 
 #[derive(Debug, Clone)]
 struct AnswerPage {
     question: Question,
-    /// The response message, with all signals 0.
+    /// The response message with all signals 0.
     template: Vec<u8>,
-    /// Each signal of the response, paired with the byte of the message at which the signal's layout starts.
+    /// Signals, each with the byte at which its layout starts.
     fields: Vec<(usize, InputField)>,
 }
 
-/// A message, or a multiplexer page of a message.
+/// A message or a multiplexer page.
 #[derive(Debug, Clone)]
 struct InputPage {
     bus: BusIndex,
@@ -80,18 +76,18 @@ struct InputPage {
 #[derive(Debug, Clone)]
 struct InputField {
     channel: Channel,
-    /// Index among all fields of the encoder, for [`RowPlaces`].
+    /// Index for [`RowPlaces`].
     number: usize,
     plan: SignalPlan,
     scale: f64,
     offset: f64,
-    /// Code for "no value"; `None` = no such code exists.
+    /// Code for a missing value.
     missing: Option<u64>,
-    /// The code of charging and the code of discharging, if the field gives the direction of the current.
+    /// Codes for charging and discharging, if the field is the direction of the current.
     direction: Option<[u64; 2]>,
-    /// Whether the field carries the magnitude of the current, and another field its direction.
+    /// Whether another field carries the direction of the current.
     is_magnitude: bool,
-    /// Whether `missing` is a configured "not available" code. If so, the channel causes a frame even without a value.
+    /// Whether `missing` is a configured "not available" code.
     has_not_available: bool,
 }
 
@@ -130,12 +126,11 @@ impl InputField {
         of_fields.get(self.number).copied().flatten()
     }
 
-    /// The field's value in a row; NaN counts as missing.
+    /// NaN counts as missing.
     fn value(&self, row: PlacedRow<'_>) -> Option<f64> {
         row.values.get(self.place(row.of_fields)?)?.1.filter(|value| !value.is_nan())
     }
 
-    /// Whether the field requires a frame.
     fn is_sent(&self, row: PlacedRow<'_>) -> bool {
         self.place(row.of_fields).is_some() && (self.has_not_available || self.value(row).is_some())
     }
@@ -150,8 +145,7 @@ impl InputField {
     }
 }
 
-/// The code of charging and the code of discharging; `None` = the signal is not the direction of the current, or has no
-/// such codes.
+/// Codes for charging and discharging; `None` = the signal is not a direction or lacks a code.
 fn direction_codes(binding: &Binding) -> Option<[u64; 2]> {
     let code = |direction: f64| {
         (0..=binding.plan.all_ones().min(MAX_DIRECTION_CODE)).find(|code| {
@@ -167,8 +161,7 @@ impl InputEncoder {
     pub fn new(map: &InputMap) -> Self {
         let same_message = |a: &Binding, b: &Binding| (a.bus, a.id) == (b.bus, b.id);
         let pages = map.bindings().chunk_by(same_message).flat_map(|message| {
-            // If the message has multiplexed signals, the signals that are always present are on the pages of the
-            // multiplexed signals.
+            // Signals that are always present are encoded on every page.
             let paged = message.iter().any(|binding| !binding.mux.is_empty());
             let of_a_page = message.iter().filter(|binding| !paged || !binding.mux.is_empty());
             let mut templates: Vec<_> = of_a_page.map(template).collect();
@@ -179,14 +172,14 @@ impl InputEncoder {
         Self { pages: pages.collect(), answers: Vec::new(), places: RefCell::default() }.numbered()
     }
 
-    /// Adds diagnostic responses, which are encoded after the frames.
+    /// Adds diagnostic responses.
     #[must_use]
     pub fn with_answers(self, answers: &[Answer]) -> Self {
         Self { answers: answers.iter().map(AnswerPage::new).collect(), ..self }.numbered()
     }
 
-    /// Appends the frames that carry `values` to `out`; `None` and NaN mean "no value". Returns the number of values
-    /// that no frame could carry.
+    /// Appends the frames that carry `values` to `out`. `None` and NaN mean "no value". Returns the number of values
+    /// that no frame carries.
     pub fn encode(&self, values: &[(Channel, Option<f64>)], out: &mut Vec<(BusIndex, Frame)>) -> usize {
         let mut places = self.places.borrow_mut();
         if !places.are_of(values) {
@@ -217,7 +210,7 @@ impl InputEncoder {
     }
 
     fn numbered(mut self) -> Self {
-        // The direction of a current is sent before its magnitude, even in another message.
+        // The direction is sent before the magnitude, even in another message.
         self.pages.sort_by_key(|page| !page.fields.iter().any(|field| field.direction.is_some()));
         let of_pages = self.pages.iter_mut().flat_map(|page| &mut page.fields);
         let of_answers = self.answers.iter_mut().flat_map(|answer| &mut answer.fields).map(|(_, field)| field);
@@ -231,7 +224,6 @@ impl InputEncoder {
         self
     }
 
-    /// Finds the positions of the fields' values in rows with these channels.
     fn find_places(&self, values: &[(Channel, Option<f64>)]) -> RowPlaces {
         let last: BTreeMap<Channel, usize> = values.iter().enumerate().map(|(place, value)| (value.0, place)).collect();
         let of_pages = self.pages.iter().flat_map(|page| &page.fields);
@@ -249,9 +241,8 @@ impl InputEncoder {
 }
 
 impl RowPlaces {
-    /// Whether the positions were found for a row with the same channels.
     fn are_of(&self, values: &[(Channel, Option<f64>)]) -> bool {
-        // An encoder that has not encoded a row has no positions yet.
+        // Before the first row, there are no positions.
         let is_found = !self.of_fields.is_empty() && self.channels.len() == values.len();
         is_found && self.channels.iter().zip(values).all(|(of, (channel, _))| of.channel == *channel)
     }
@@ -267,8 +258,7 @@ impl AnswerPage {
         Self { question: answer.question, template, fields: answer.signals.iter().map(field).collect() }
     }
 
-    /// The response with these values; `None` = the response carries none of these values, or a missing value has no
-    /// code.
+    /// The response; `None` = it carries none of the values, or a missing value has no code.
     fn message(&self, row: PlacedRow<'_>) -> Option<Vec<u8>> {
         if !self.fields.iter().any(|(_, field)| field.is_sent(row)) {
             return None;
@@ -281,7 +271,7 @@ impl AnswerPage {
         Some(message)
     }
 
-    /// Appends the request and the response, with the flow control after the first frame of the response.
+    /// Appends request, response and flow control.
     fn exchange(&self, message: &[u8], out: &mut Vec<(BusIndex, Frame)>) {
         let Controller { bus, request, request_extension, response, response_extension } = self.question.controller;
         let of_tester = |payload: &[u8]| Frame::classic(request, payload).map(|frame| (bus, frame));
@@ -298,7 +288,7 @@ impl AnswerPage {
 }
 
 impl InputPage {
-    /// Creates the page with the selectors of `template` and every signal that is present with these selectors.
+    /// Creates the page with every signal that is present with these selectors.
     fn new(message: &[Binding], template: [u8; MAX_DATA]) -> Self {
         let (bus, id) = (message[0].bus, message[0].id);
         let present: Vec<_> = message.iter().filter(|binding| binding.holds(&template) == Ok(true)).collect();
@@ -323,12 +313,12 @@ impl InputPage {
     }
 }
 
-/// A payload with the selectors of the binding's page. Each selector has the first code of its first range.
+/// Payload with the selectors of the binding's page. Each selector has the first code of its first range.
 fn template(binding: &Binding) -> [u8; MAX_DATA] {
     let mut payload = [0; MAX_DATA];
     for test in &binding.mux {
         let code = test.ranges.first().map_or(0, |range| range.0);
-        // If the code does not fit the selector, the page cannot occur on the bus, and the selector stays 0.
+        // A code that does not fit the selector cannot occur on the bus.
         let _ = test.plan.encode_raw(&mut payload, code);
     }
     payload

@@ -1,20 +1,18 @@
-//! Creates the layout of the sent frames and of the command frame: one [`Database`] for the encoder and for consumers.
+//! Creates the layout of the sent frames and of the command frame as a [`Database`].
 //!
 //! In: a base (the built-in `config/packwatch.dbc`, or the user's own DBC) and settings per message. Out: the base's
-//! messages with the configured identifiers, frame formats, cycle times, end-to-end protection and authentication. A
-//! protected message includes the signals of its header (CRC and counter). An authenticated message includes the
-//! signals of its trailer (freshness and authenticator). The encoder is built from this database, and `packwatch dbc`
-//! writes this database, so the encoder and the written DBC always agree.
+//! messages with these settings. A protected message includes the signals of its header (CRC and counter). An
+//! authenticated message includes the signals of its trailer (freshness and authenticator). The encoder and
+//! `packwatch dbc` both use this database, so that sent frames always match the written DBC.
 //!
 //! The built-in base is adapted:
 //!
 //! * The steps of Ah signals grow with the cell's capacity.
 //! * The header of profile 5 is one byte longer than the reserved space, so all signals move up by a byte.
 //! * An authenticated message grows by its trailer.
-//! * An authenticated command omits the header's bytes.
+//! * An authenticated command has no header, so its signals move to the start of the message.
 //!
-//! The user's own DBC is not adapted: its signals must leave header and trailer free. All settings that do not fit are
-//! reported together.
+//! The user's own DBC must leave header and trailer free. All settings that do not fit are reported together.
 
 use std::sync::OnceLock;
 
@@ -25,41 +23,36 @@ use crate::can::secoc::{self, Authentication};
 use crate::can::signal::{ByteOrder, SignalLayout, ValueType};
 use crate::can::{CanId, FrameKind};
 
-/// Names of the signals that protection and authentication write. Signals that carry the daemon's values never have
-/// these names.
+/// Names of the signals that protection and authentication write.
 pub(super) const HEADER_SIGNALS: [&str; 5] = ["E2eCrc", "E2eCounter", "E2eDataIdNibble", "SecOCFreshness", "SecOCMac"];
 
-/// Length (bytes) of a built-in message whose signals were moved for profile 5. It is the next FD length above 8.
+/// The next FD length above 8, for the header of profile 5.
 const MOVED_LEN_BYTES: u16 = 12;
 
-/// Number of repetitions of a changed alarm after its first frame. If one in ten frames is lost, all four frames of a
-/// change are lost once in 10,000 changes.
+/// Number of repetitions of a changed alarm. If one in ten frames is lost, all four frames of a change are lost once in
+/// 10,000 changes.
 pub const CHANGE_REPETITIONS: u32 = 3;
-/// Time between repetitions of a changed alarm, ms. It is longer than most error bursts on a bus.
+/// Time between the repetitions of a changed alarm, ms. Most error bursts on a bus are shorter.
 pub const CHANGE_REPETITION_MS: u32 = 100;
-/// Smallest mean time between two alarm frames, ms. The resulting 100 frames a second use 2.7 % of a bus of 500 kbit/s.
+/// Minimum average time between two alarm frames, ms. 100 frames a second use 2.7 % of a bus of 500 kbit/s.
 pub const ALARM_DELAY_MS: u32 = 10;
-/// Smallest mean time between two replies, ms.
+/// Minimum average time between two replies, ms.
 pub const REPLY_DELAY_MS: u32 = 100;
 
 /// Period of the freshness announcements, ms. A command is valid for two periods at most.
 pub const FRESHNESS_PERIOD_MS: u32 = 1000;
 
-/// Cycle time of a sent message if neither the settings nor the base give one, ms.
+/// Cycle time, ms, if neither the settings nor the base state a cycle time.
 pub const DEFAULT_PERIOD_MS: u32 = 1000;
 
-/// The DBC shipped with the program.
-///
-/// # Errors
-/// Never occurs, because a test parses the shipped file.
+/// The DBC shipped with the program. Parsing never fails, because a test parses the file.
 pub fn default_database() -> Result<Database, DbcError> {
     Database::parse(include_str!("../../packwatch.dbc"))
 }
 
-/// The shipped DBC. It is parsed only once, because parsing takes longer than the rest of loading a configuration.
+/// Parsed once, because parsing takes longer than the rest of loading a configuration.
 fn shipped() -> &'static Database {
     static SHIPPED: OnceLock<Database> = OnceLock::new();
-    // Cannot fail: a test parses the shipped file.
     SHIPPED.get_or_init(|| default_database().unwrap_or_default())
 }
 
@@ -69,13 +62,11 @@ pub enum LayoutMessage {
     Status,
     Health,
     Alarm,
-    /// Command frame, which the daemon receives.
+    /// Received, not sent.
     Command,
-    /// Digest of all alarms.
     Digest,
-    /// Reply to a command frame.
     Reply,
-    /// Announcement of the freshness of authenticated commands.
+    /// Announces the freshness of authenticated commands.
     Freshness,
 }
 
@@ -97,7 +88,7 @@ impl LayoutMessage {
         }
     }
 
-    /// Name of the message's table in the configuration (such as `output.status`) and in the program's texts.
+    /// Name in the configuration (such as `output.status`) and in the program's texts.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Status => "status",
@@ -132,12 +123,10 @@ impl LayoutMessage {
 /// End-to-end protection of a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum E2eSetting {
-    /// The protection of the base; the built-in base has no protection.
+    /// As in the base; the built-in base has no protection.
     #[default]
     AsBase,
-    /// The message has no protection.
     Off,
-    /// The message has this protection.
     On(Protection),
 }
 
@@ -145,11 +134,9 @@ pub enum E2eSetting {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct MessageSettings {
     pub id: Option<CanId>,
-    /// Whether the message is sent in FD frames.
     pub fd: Option<bool>,
     /// Whether the data phase uses the higher bit rate.
     pub brs: Option<bool>,
-    /// Cycle time, ms.
     pub period_ms: Option<u32>,
     pub e2e: E2eSetting,
     /// Authentication; `None` = not authenticated.
@@ -159,12 +146,9 @@ pub struct MessageSettings {
 /// Base of a layout.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum LayoutBase<'d> {
-    /// The shipped DBC, adapted to a cell of this rated capacity (Ah).
-    BuiltIn {
-        /// Rated capacity (Ah).
-        rated_capacity_ah: f64,
-    },
-    /// The user's own DBC, which is not adapted.
+    /// The shipped DBC, adapted to this rated capacity.
+    BuiltIn { rated_capacity_ah: f64 },
+    /// The user's own DBC, not adapted.
     Own(&'d Database),
 }
 
@@ -174,13 +158,12 @@ pub struct LayoutSettings {
     pub status: MessageSettings,
     pub health: MessageSettings,
     pub alarm: MessageSettings,
-    /// Command frame; `None` = commands are not accepted.
+    /// `None` = commands are not accepted.
     pub command: Option<MessageSettings>,
-    /// Digest of all alarms.
     pub digest: MessageSettings,
-    /// Reply to a command frame; sent only if commands are accepted.
+    /// Sent only if commands are accepted.
     pub reply: MessageSettings,
-    /// Announcement of freshness; sent only if commands are authenticated.
+    /// Sent only if commands are authenticated.
     pub freshness: MessageSettings,
 }
 
@@ -203,17 +186,13 @@ impl LayoutSettings {
 #[error("{}: {what}", .message.message())]
 pub struct SettingFault {
     pub message: LayoutMessage,
-    /// Key of the setting: `fd`, `brs`, `e2e`, `data_id`, `secoc`.
+    /// `fd`, `brs`, `e2e`, `data_id` or `secoc`.
     pub key: &'static str,
-    /// The fault: what was found and what is allowed.
     pub what: String,
 }
 
-/// Creates the layout. Omits messages that the base does not have; `OutputPlan` and `CommandPlan` report missing
-/// messages.
-///
-/// # Errors
-/// All settings that do not fit.
+/// Creates the layout, or returns all settings that do not fit. Messages that the base lacks are omitted; `OutputPlan`
+/// and `CommandPlan` report them.
 pub fn layout(base: LayoutBase<'_>, settings: &LayoutSettings) -> Result<Database, Vec<SettingFault>> {
     let (database, rated_capacity_ah) = match base {
         LayoutBase::BuiltIn { rated_capacity_ah } => (shipped(), Some(rated_capacity_ah)),
@@ -245,7 +224,7 @@ pub fn layout(base: LayoutBase<'_>, settings: &LayoutSettings) -> Result<Databas
     Ok(Database { nodes: database.nodes.clone(), comment: database.comment.clone(), messages, left_out: Vec::new() })
 }
 
-/// Applies the settings to a message. If `movable` is true, its signals may be moved.
+/// `movable`: whether the message's signals may be moved.
 fn apply(
     message: &mut Message,
     settings: &MessageSettings,
@@ -301,7 +280,7 @@ fn apply(
 
 fn format(message: &Message, settings: &MessageSettings) -> FrameFormat {
     let (was_fd, was_brs) = match message.format {
-        // A DBC without a format attribute implies FD if the message is longer than a classic frame.
+        // Without a format attribute, a message that is longer than a classic frame implies FD.
         FrameFormat::Classic => (message.len_bytes > 8, false),
         FrameFormat::Fd { brs } => (true, brs),
     };
@@ -311,7 +290,7 @@ fn format(message: &Message, settings: &MessageSettings) -> FrameFormat {
     }
 }
 
-/// Makes room for the third byte of profile 5's header by moving all signals up by one byte.
+/// Makes room for the third byte of profile 5's header.
 fn move_up(message: &mut Message) {
     for signal in &mut message.signals {
         signal.layout.start_bit += 8;
@@ -319,10 +298,10 @@ fn move_up(message: &mut Message) {
     message.len_bytes = MOVED_LEN_BYTES;
 }
 
-/// Moves the signals of a command to the start of the message, because an authenticated command has no header.
+/// An authenticated command has no header, so its signals move to the start.
 fn move_down(message: &mut Message) {
     for signal in &mut message.signals {
-        // The header of end-to-end protection has two bytes.
+        // The header has two bytes.
         signal.layout.start_bit = signal.layout.start_bit.saturating_sub(16);
     }
     // Length without the header and with fewer unused bytes.
@@ -334,7 +313,7 @@ fn set_header(message: &mut Message) {
     let mut header = message.e2e.map(header_signals).unwrap_or_default();
     header.extend(message.secoc.into_iter().flat_map(|secoc| trailer_signals(message.len_bytes, secoc)));
     let is_kept = |signal: &Signal| !HEADER_SIGNALS.contains(&signal.name.as_str());
-    // Conditions refer to multiplexors by index, and the indices change.
+    // Conditions refer to multiplexors by index, and the header changes the indices.
     let mut next = header.len();
     let places = message.signals.iter().map(|signal| {
         let place = is_kept(signal).then_some(next);
@@ -351,7 +330,7 @@ fn set_header(message: &mut Message) {
     }));
 }
 
-/// Signals of the header. With these signals, a consumer needs only the DBC to check the header.
+/// Signals of the header, with which a consumer can check the header from the DBC alone.
 fn header_signals(protection: Protection) -> Vec<Signal> {
     let Protection { profile, data_id } = protection;
     let crc = format!("CRC of end-to-end profile {}, data id {data_id}.", profile.name());
@@ -367,14 +346,12 @@ fn header_signals(protection: Protection) -> Vec<Signal> {
     }
 }
 
-/// Signals of freshness and authenticator at the end of a message of this length.
 fn trailer_signals(len_bytes: u16, authentication: Authentication) -> Vec<Signal> {
     let Authentication { profile, data_id } = authentication;
     let length = |bits: u32| u16::try_from(bits).unwrap_or(0);
     let (freshness, mac) = (length(profile.freshness_bits()), length(profile.mac_bits()));
     let first = 8 * len_bytes.saturating_sub(length(u32::from(freshness + mac) / 8));
-    // In a DBC, a big-endian signal starts at its most significant bit. The bits of a byte count from the least
-    // significant bit.
+    // A big-endian signal starts at its most significant bit. Bit 0 is the least significant bit of a byte.
     let place = |bit: u16| bit / 8 * 8 + 7 - bit % 8;
     let signal = |name, bit, length_bits, comment: &str| {
         let mut signal = header_signal(name, place(bit), length_bits, comment);
@@ -401,7 +378,7 @@ fn header_signal(name: &str, start_bit: u16, length_bits: u16, comment: &str) ->
             factor: 1.0,
             offset: 0.0,
             minimum: 0.0,
-            // Stated only if a float represents the maximum exactly; 0 = not stated.
+            // 0 = not stated, because a float cannot represent the maximum exactly.
             maximum: if length_bits < 53 { ((1_u64 << length_bits) - 1) as f64 } else { 0.0 },
         },
         unit: String::new(),
@@ -413,7 +390,6 @@ fn header_signal(name: &str, start_bit: u16, length_bits: u16, comment: &str) ->
     }
 }
 
-/// Checks that the header fits into the message and that no other signal overlaps it.
 fn check_header(message: &Message, protection: Protection, fault: &mut impl FnMut(&'static str, String)) {
     let Protection { profile, data_id } = protection;
     let (name, len, word) = (&message.name, usize::from(message.len_bytes), profile.name());
@@ -443,7 +419,6 @@ fn check_header(message: &Message, protection: Protection, fault: &mut impl FnMu
     }
 }
 
-/// Checks that the trailer fits into the message and that no other signal overlaps it.
 fn check_trailer(message: &Message, authentication: Authentication, fault: &mut impl FnMut(&'static str, String)) {
     let (name, len, trailer) = (&message.name, usize::from(message.len_bytes), authentication.profile.trailer_bytes());
     let word = authentication.profile.name();
@@ -463,9 +438,8 @@ fn check_trailer(message: &Message, authentication: Authentication, fault: &mut 
     }
 }
 
-/// Adapts the steps of Ah signals: multiplies the built-in step by the smallest factor of 1, 2, 5, 10, ... with which
-/// the largest possible value fits. The largest possible value is twice the rated capacity; for a standard deviation,
-/// it is half of the rated capacity.
+/// Multiplies the steps of Ah signals by the smallest factor of 1, 2, 5, 10, ... with which the largest possible value
+/// fits. This value is twice the rated capacity, or half of it for a standard deviation.
 fn fit_steps(message: &mut Message, rated_capacity_ah: f64) {
     let largest_ah = |signal: &Signal| rated_capacity_ah * if signal.name.ends_with("Std") { 0.5 } else { 2.0 };
     for is_std in [false, true] {
@@ -479,16 +453,16 @@ fn fit_steps(message: &mut Message, rated_capacity_ah: f64) {
     }
 }
 
-/// The smallest of 1, 2, 5, 10, ... that is not below `needed`; at most `LARGEST`.
+/// The smallest of 1, 2, 5, 10, ... that is at least `needed`; at most `LARGEST`.
 fn times(needed: f64) -> f64 {
-    /// The largest result. It allows capacities up to a million times 40 Ah, more than any cell has.
+    /// Allows capacities up to a million times 40 Ah, more than any cell has.
     const LARGEST: f64 = 1e6;
     let ladder = std::iter::successors(Some(1.0), |decade| Some(decade * 10.0)).take_while(|decade| *decade < LARGEST);
     let mut ladder = ladder.flat_map(|decade| [decade, 2.0 * decade, 5.0 * decade]);
     ladder.find(|step| *step >= needed).unwrap_or(LARGEST)
 }
 
-/// Rounds away the digits that floating-point arithmetic adds to a decimal number.
+/// Removes the digits that floating-point arithmetic adds to a decimal number.
 fn decimal(value: f64) -> f64 {
     format!("{value:.6}").parse().unwrap_or(value)
 }

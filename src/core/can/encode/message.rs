@@ -1,4 +1,4 @@
-//! Prepares a message of a layout for encoding: signals, "not available" codes, pages, protection.
+//! Prepares a message of a layout for encoding.
 //!
 //! In: values by signal name. Out: frames. A message that cannot be encoded is rejected with all its faults.
 
@@ -15,8 +15,8 @@ use crate::can::{CanId, Frame, MAX_DATA};
 #[error("{}", .0.join("\n"))]
 pub struct PlanFaults(pub Vec<String>);
 
-/// The alarm rules in the order of their numbers, which start at 1. Each rule has its own `Value_...` and
-/// `Threshold_...` signals, because the units of the rules differ.
+/// The alarm rules in the order of their numbers, from 1. Each rule has its own `Value_...` and `Threshold_...`
+/// signals, because the units differ.
 pub(super) const RULES: [&str; 18] = [
     "CapacityLow",
     "UsableCapacityLow",
@@ -52,7 +52,7 @@ pub(super) struct OutputMessage {
 #[derive(Debug, Clone, PartialEq)]
 struct OutputField {
     name: String,
-    /// Index of the name in the list passed to [`OutputMessage::with_places`].
+    /// Index in the list passed to [`OutputMessage::with_places`].
     place: Option<usize>,
     plan: SignalPlan,
     not_available: u64,
@@ -64,7 +64,7 @@ struct OutputField {
 }
 
 impl OutputMessage {
-    /// Prepares the message with the given name, which must have all `required` signals.
+    /// Prepares a message, which must have all `required` signals.
     pub(super) fn new(database: &Database, name: &str, required: &[&str], faults: &mut Vec<String>) -> Option<Self> {
         let Some(message) = database.message(name) else {
             faults.push(format!("message {name} is missing"));
@@ -93,7 +93,7 @@ impl OutputMessage {
         })
     }
 
-    /// Checks that every rule has a value signal and a threshold signal that are present on the rule's page only.
+    /// Checks that every rule has a value signal and a threshold signal, on its own page only.
     pub(super) fn check_rules(&self, rules: &[&str], faults: &mut Vec<String>) {
         if self.fields.iter().any(|field| field.name == "Rule" && !field.is_multiplexor) {
             faults.push("signal PACKWATCH_Alarm.Rule must be the multiplexor (M)".to_owned());
@@ -114,12 +114,12 @@ impl OutputMessage {
         }
     }
 
-    /// Factor from the program's unit to the unit of a signal; 1 if the signal is missing.
+    /// Factor from the internal unit to a signal's unit; 1 if the signal is missing.
     pub(super) fn per_inside_unit(&self, name: &str) -> f64 {
         self.fields.iter().find(|field| field.name == name).map_or(1.0, |field| field.per_inside_unit)
     }
 
-    /// First selector code of every page; a message without pages has only page 0.
+    /// First selector code of every page. A message without pages has only page 0.
     pub(super) fn page_codes(&self) -> Vec<u64> {
         let mut codes: Vec<_> = self.fields.iter().filter_map(|field| Some(field.pages.first()?.0)).collect();
         codes.sort_unstable();
@@ -127,12 +127,11 @@ impl OutputMessage {
         if codes.is_empty() { vec![0] } else { codes }
     }
 
-    /// Number of bytes before the trailer of an authenticated message.
     fn data_len(&self) -> usize {
         self.len.saturating_sub(self.secoc.map_or(0, |secoc| secoc.profile.trailer_bytes()))
     }
 
-    /// Stores the index of each signal's name in a list, so that encoding does not search for it.
+    /// Stores the index of each signal's name in `names`, so that encoding need not search.
     pub(super) fn with_places(mut self, names: &[&str]) -> Self {
         for field in &mut self.fields {
             field.place = names.iter().position(|name| *name == field.name);
@@ -140,20 +139,20 @@ impl OutputMessage {
         self
     }
 
-    /// The message without the signals whose [place](Self::with_places) is chosen.
+    /// Removes the signals whose [index](Self::with_places) is chosen.
     pub(super) fn without(mut self, is_chosen: impl Fn(Option<usize>) -> bool) -> Self {
         self.fields.retain(|field| !is_chosen(field.place));
         self
     }
 
-    /// The places of all signals.
+    /// The [indices](Self::with_places) of all signals.
     pub(super) fn places(&self) -> impl Iterator<Item = usize> + '_ {
         self.fields.iter().filter_map(|field| field.place)
     }
 
-    /// Encodes a page. `value` returns the value of a signal from its name and its [index](Self::with_places).
-    /// `counter` is the protection's next counter, which this function advances. The trailer of an authenticated
-    /// message stays 0; it is written once the freshness is known.
+    /// Encodes a page. `value` returns a signal's value from its name and its [index](Self::with_places). `counter` is
+    /// the next end-to-end counter, which this function advances. The trailer of an authenticated message stays 0 until
+    /// the caller knows the freshness.
     pub(super) fn frame(
         &self,
         page: u64,
@@ -167,13 +166,13 @@ impl OutputMessage {
             } else {
                 field.code(value(&field.name, field.place))
             };
-            // Cannot fail: the signal was checked against the message's length, and the code fits the signal.
+            // Cannot fail: the position was checked, and the code fits.
             let _ = field.plan.encode_raw(&mut payload, code);
         }
         if let (Some(protection), Some(payload)) = (self.protection, payload.get_mut(..self.data_len())) {
             // A counter restored from another profile may exceed this profile's largest counter.
             let now = (*counter).min(protection.profile.max_counter());
-            // Cannot fail: length and data id were checked when the plan was created.
+            // Cannot fail: length and data id were checked.
             let _ = protection.protect(payload, now);
             *counter = protection.profile.next_counter(now);
         }
@@ -181,12 +180,11 @@ impl OutputMessage {
             FrameFormat::Classic => Frame::classic(self.id, payload.get(..self.len).unwrap_or(&[])),
             FrameFormat::Fd { brs } => Frame::fd_padded(self.id, brs, false, self.len, &payload),
         };
-        // The frame always exists, because lengths were checked when the plan was created.
+        // The frame always exists, because the length was checked.
         frame.unwrap_or(Frame::empty(self.id))
     }
 }
 
-/// Checks that the message fits into its frames, and that its protection fits into the message.
 fn check_length(message: &Message, faults: &mut Vec<String>) {
     let (name, len) = (&message.name, usize::from(message.len_bytes));
     if len > MAX_DATA {
@@ -205,8 +203,7 @@ fn check_length(message: &Message, faults: &mut Vec<String>) {
     }
 }
 
-/// Checks that the multiplexor has a code for every page. Otherwise, a page would be sent with the number of another
-/// page.
+/// Checks that the multiplexor has a code for every page. Otherwise, a page would be sent with another page's code.
 fn check_pages(message: &str, fields: &[OutputField], faults: &mut Vec<String>) {
     for selector in fields.iter().filter(|field| field.is_multiplexor) {
         let highest = selector.plan.all_ones();
@@ -260,7 +257,7 @@ impl OutputField {
         }
     }
 
-    /// The code below the "not available" code; the code above it if the "not available" code is the lowest code.
+    /// The code below the "not available" code, or the code above if "not available" is the lowest code.
     fn neighbour(&self, taken: u64) -> u64 {
         let lowest = match self.plan.value_type() {
             ValueType::Signed => 1 << (self.plan.length_bits() - 1),

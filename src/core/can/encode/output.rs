@@ -1,13 +1,11 @@
-//! Encodes the frames that the daemon sends, with a layout.
+//! Encodes the frames that the daemon sends.
 //!
-//! Any DBC with the message and signal names of the shipped `config/packwatch.dbc` can be used. An unknown value is
-//! sent as the code that the DBC's value table calls "not available". If the table has no such code, an unknown value
-//! is sent as all ones (unsigned), the lowest code (signed) or NaN (float). If a known value would have the same code,
-//! it is sent as the neighbouring code (except in signals of one bit). End-to-end headers use the counters that the
-//! caller keeps ([`SendCounters`]).
+//! The layout may be any DBC with the message and signal names of the shipped `config/packwatch.dbc`. An unknown value
+//! is sent as the code that the DBC calls "not available". If there is no such code, it is sent as all ones (unsigned),
+//! the lowest code (signed) or NaN (float). If a known value would have the same code, it is sent as the neighbouring
+//! code, except in signals of one bit. The caller keeps the counters of end-to-end protection ([`SendCounters`]).
 //!
-//! A DBC is rejected with all its faults if signals are missing. It is also rejected if a value could be mistaken for
-//! the value of another rule or page.
+//! A DBC is rejected if signals are missing, or if a value could be mistaken for the value of another rule or page.
 
 use serde::{Deserialize, Serialize};
 
@@ -22,7 +20,7 @@ use crate::can::{CanId, Frame};
 use crate::quantity::catalogue::{PackValues, Part, Quantity as Q};
 use crate::quantity::{CellIndex, Mode};
 
-/// Signals of a message with the functions that return their values.
+/// Signals with the functions that return their values.
 type SignalTable<T, const N: usize> = [(&'static str, fn(&T) -> Option<f64>); N];
 
 const STATUS: SignalTable<StatusFields, 8> = [
@@ -36,7 +34,7 @@ const STATUS: SignalTable<StatusFields, 8> = [
     ("UnknownRules", |f| f.unknown_rules.map(f64::from)),
 ];
 
-/// Signals of the health frame, on any page; the first [`HEALTH_REQUIRED`] are required.
+/// Signals of the health frame, on any page. The first [`HEALTH_REQUIRED`] signals are required.
 const HEALTH: SignalTable<HealthFields, 18> = [
     ("Capacity", |f| f.capacity_ah),
     ("CapacityStd", |f| f.capacity_std_ah),
@@ -59,7 +57,7 @@ const HEALTH: SignalTable<HealthFields, 18> = [
 ];
 const HEALTH_REQUIRED: usize = 8;
 
-/// Signals of the health frame with energy, time and power, which [`OutputPlan::without_outlook`] leaves out.
+/// Signals of the health frame that [`OutputPlan::without_outlook`] leaves out.
 const OUTLOOK: [(&str, Q, Part); 18] = [
     ("RemainingEnergy", Q::RemainingEnergy, Part::Mean),
     ("RemainingEnergyStd", Q::RemainingEnergy, Part::Std),
@@ -87,87 +85,77 @@ const ALARM: [&str; 6] = ["Rule", "State", "Severity", "Test", "Cell", "Acknowle
 /// Contents of the status frame; `None` = not available.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct StatusFields {
-    /// State of charge, fraction.
+    /// Fraction.
     pub soc: Option<f64>,
-    /// Standard deviation of the SOC, fraction.
+    /// Fraction.
     pub soc_std: Option<f64>,
-    /// Operating mode of the pack.
     pub mode: Option<Mode>,
-    /// Wire code of the validity: 0 unavailable, 1 valid, 2 degraded, 3 untrusted.
+    /// Wire code: 0 unavailable, 1 valid, 2 degraded, 3 untrusted.
     pub validity: u8,
-    /// Wire code of the highest severity: 0 none, 1 info, 2 warning, 3 severe.
+    /// Wire code: 0 none, 1 info, 2 warning, 3 severe.
     pub highest_severity: Option<u8>,
-    /// Number of active alarms.
     pub active_alarms: Option<u16>,
-    /// The cell that limits discharge.
     pub limiting_cell: Option<CellIndex>,
-    /// Wire code for the number of rules that are unknown: 0 none, 1 some, 2 all.
+    /// Wire code of the number of unknown rules: 0 none, 1 some, 2 all.
     pub unknown_rules: Option<u8>,
 }
 
 /// Contents of all pages of the health frame; `None` = not available.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct HealthFields {
-    /// Lowest capacity of a cell (Ah).
+    /// Lowest capacity of a cell.
     pub capacity_ah: Option<f64>,
-    /// Standard deviation of the capacity (Ah).
     pub capacity_std_ah: Option<f64>,
-    /// State of health: capacity as a fraction of the rated capacity.
+    /// Capacity as a fraction of the rated capacity.
     pub soh: Option<f64>,
-    /// Recharge period (s).
     pub recharge_period_s: Option<f64>,
-    /// Recharge period with the reference charger (s).
+    /// With the reference charger.
     pub normalized_recharge_period_s: Option<f64>,
-    /// Usable capacity (Ah).
     pub usable_capacity_ah: Option<f64>,
-    /// Standard deviation of the usable capacity (Ah).
     pub usable_capacity_std_ah: Option<f64>,
-    /// Resistance relative to new (1 = as new).
+    /// Relative to new.
     pub resistance_ratio: Option<f64>,
-    /// Equivalent full cycles until the end of life, median. This value and all following values are sent only if the
-    /// DBC has signals for them.
+    /// Equivalent full cycles until the end of life, median. This value and the following values are optional in the
+    /// DBC.
     pub remaining_cycles: Option<f64>,
     /// 5 % quantile of `remaining_cycles`.
     pub remaining_cycles_low: Option<f64>,
-    /// Days until the end of life, median.
+    /// Median.
     pub remaining_days: Option<f64>,
-    /// Loss of lithium inventory of the cell with the lowest capacity, and the standard deviation of this loss. The
-    /// loss and its standard deviation are fractions of a new cell's inventory.
+    /// Loss of lithium inventory of the cell with the lowest capacity, and its standard deviation, as fractions of a
+    /// new cell's inventory.
     pub lli: [Option<f64>; 2],
-    /// Loss of active material of the same cell's negative electrode, and its standard deviation, as fractions.
+    /// Loss of active material of the negative electrode of the cell with the lowest capacity, and its standard
+    /// deviation, as fractions.
     pub lam_ne: [Option<f64>; 2],
-    /// Loss of active material of the same cell's positive electrode, and its standard deviation, as fractions.
+    /// Loss of active material of the positive electrode of the cell with the lowest capacity, and its standard
+    /// deviation, as fractions.
     pub lam_pe: [Option<f64>; 2],
-    /// Wire code that says how well the cells' model is known.
+    /// Wire code: how well the cells' model is known.
     pub model_state: Option<u8>,
-    /// Energy, time and power of the pack.
     pub outlook: PackValues,
 }
 
 /// Contents of one alarm frame.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct AlarmFields {
-    /// Number of the rule.
     pub rule: u8,
-    /// Wire code of the state: 0 inactive, 1 active, 2 cleared, 3 pending, 4 latched, 5 suppressed (raised, but its
-    /// input is invalid), 6 unknown; `None` = not available.
+    /// Wire code: 0 inactive, 1 active, 2 cleared, 3 pending, 4 latched, 5 suppressed (raised, but its input is
+    /// invalid), 6 unknown.
     pub state: Option<u8>,
-    /// Wire code of the severity: 1 info, 2 warning, 3 severe; `None` = unknown.
+    /// Wire code: 1 info, 2 warning, 3 severe; `None` = unknown.
     pub severity: Option<u8>,
-    /// Whether the alarm is a test.
     pub test: bool,
-    /// Whether the alarm is acknowledged.
     pub acknowledged: bool,
-    /// The cell; `None` = the whole pack.
+    /// `None` = the whole pack.
     pub cell: Option<CellIndex>,
-    /// The value, in the rule's internal unit.
+    /// In the rule's internal unit.
     pub value: Option<f64>,
-    /// The threshold, in the rule's internal unit.
+    /// In the rule's internal unit.
     pub threshold: Option<f64>,
 }
 
-/// The next counter of each message's end-to-end protection. The counters must survive a restart: if a counter jumps
-/// back, the receiver rejects the frame as repeated or out of sequence.
+/// The next end-to-end counters. They must survive a restart, because a receiver rejects counters that jump back.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SendCounters {
@@ -184,7 +172,6 @@ pub struct OutputPlan {
     status: OutputMessage,
     health: OutputMessage,
     alarm: OutputMessage,
-    /// Selector codes of the health frame, in ascending order.
     pages: Vec<u64>,
     /// `None` = the layout has no digest.
     digest: Option<DigestPlan>,
@@ -197,26 +184,22 @@ pub struct OutputPlan {
 pub struct SentMessage {
     pub message: LayoutMessage,
     pub id: CanId,
-    /// Kind of the message's frames.
     pub format: FrameFormat,
     pub protection: Option<Protection>,
     pub secoc: Option<Authentication>,
-    /// Cycle time, ms; `None` = sent only on an event.
+    /// `None` = sent only on an event.
     pub cycle_time_ms: Option<u32>,
 }
 
 impl SentMessage {
-    /// Data id of protection or authentication; `None` = the message has neither.
+    /// Data id of the protection or the authentication.
     pub fn data_id(&self) -> Option<u16> {
         self.protection.map(|protection| protection.data_id).or(self.secoc.map(|secoc| secoc.data_id))
     }
 }
 
 impl OutputPlan {
-    /// Finds every message and signal that the daemon sends.
-    ///
-    /// # Errors
-    /// Every message or signal that is missing or cannot be encoded, by name.
+    /// Finds every message and signal to send, or names every message or signal that is missing or cannot be encoded.
     pub fn new(database: &Database) -> Result<Self, PlanFaults> {
         let mut faults = Vec::new();
         let mut message = |which: LayoutMessage, required: &[&str]| {
@@ -244,7 +227,7 @@ impl OutputPlan {
         }
     }
 
-    /// Leaves out the pages of the health frame that contain only energy, time and power.
+    /// Leaves out the pages that contain only energy, time and power.
     #[must_use]
     pub fn without_outlook(mut self) -> Self {
         self.health = self.health.without(|place| place.is_some_and(|place| place >= HEALTH.len()));
@@ -257,7 +240,7 @@ impl OutputPlan {
         self.health.places().any(|place| place >= HEALTH.len())
     }
 
-    /// The sent messages: status, health and alarm, followed by digest, reply and freshness if the layout has them.
+    /// The sent messages: status, health and alarm, then digest, reply and freshness if the layout has them.
     pub fn messages(&self) -> impl Iterator<Item = SentMessage> + '_ {
         let always = [
             (LayoutMessage::Status, &self.status),
@@ -282,7 +265,7 @@ impl OutputPlan {
         self.messages().map(|message| message.id).collect()
     }
 
-    /// Advances the counter of a message as if `frames` of its frames had been sent.
+    /// Advances the counter of a message as if `frames` frames had been sent.
     pub fn skip(&self, message: LayoutMessage, frames: u64, counters: &mut SendCounters) {
         let Some(protection) = self.messages().find(|sent| sent.message == message).and_then(|sent| sent.protection)
         else {
@@ -314,12 +297,12 @@ impl OutputPlan {
         }
     }
 
-    /// Whether the layout has replies.
+    /// Whether the layout has a reply.
     pub fn has_reply(&self) -> bool {
         self.reply.is_some()
     }
 
-    /// Number of pages of the digest; 0 = the layout has no digest.
+    /// Number of pages of the digest; 0 = no digest.
     pub fn digest_pages(&self) -> usize {
         self.digest.as_ref().map_or(0, DigestPlan::page_count)
     }
@@ -334,7 +317,7 @@ impl OutputPlan {
         self.status.frame(0, &mut counters.status, |_, place| value_of(&STATUS, fields, place))
     }
 
-    /// Encodes a page of the health frame, counted from 0, modulo the number of pages.
+    /// Encodes a page of the health frame. `page` counts from 0 and wraps around.
     pub fn health(&self, page: usize, fields: &HealthFields, counters: &mut SendCounters) -> Frame {
         let code = self.pages.get(page % self.pages.len().max(1)).copied().unwrap_or(0);
         self.health.frame(code, &mut counters.health, |_, place| {
@@ -346,7 +329,7 @@ impl OutputPlan {
         })
     }
 
-    /// Encodes one alarm. Its value and its threshold are in the rule's own `Value_...` and `Threshold_...` signals.
+    /// Encodes one alarm. Value and threshold are in the rule's own `Value_...` and `Threshold_...` signals.
     pub fn alarm(&self, fields: &AlarmFields, counters: &mut SendCounters) -> Frame {
         let bit = |set: bool| Some(if set { 1.0 } else { 0.0 });
         self.alarm.frame(u64::from(fields.rule), &mut counters.alarm, |name, _| match name {
@@ -363,30 +346,29 @@ impl OutputPlan {
 }
 
 impl OutputPlan {
-    /// Encodes a page of the digest, counted from 0; `None` = the layout has no such page.
+    /// Encodes a page of the digest, counted from 0; `None` = no such page.
     pub fn digest(&self, page: usize, fields: &DigestFields, counters: &mut SendCounters) -> Option<Frame> {
         self.digest.as_ref()?.frame(page, fields, &mut counters.digest)
     }
 
-    /// The announcement frame, to which the caller adds the freshness; `None` = the layout has none.
+    /// The announcement frame, to which the caller adds the freshness.
     pub fn freshness(&self) -> Option<Frame> {
         self.freshness.as_ref().map(|message| message.frame(0, &mut 0, |_, _| None))
     }
 
-    /// Encodes the reply to a command; `None` = the layout has no reply.
+    /// Encodes the reply to a command.
     pub fn reply(&self, fields: &ReplyFields, counters: &mut SendCounters) -> Option<Frame> {
         self.reply.as_ref().map(|message| reply_frame(message, fields, &mut counters.reply))
     }
 }
 
-/// The message that announces the freshness of commands; `None` = the database has none.
+/// The announcement message; `None` = the database does not announce the freshness of commands.
 fn freshness_message(database: &Database, faults: &mut Vec<String>) -> Option<OutputMessage> {
     let name = LayoutMessage::Freshness.message();
     database.message(name)?.secoc.filter(|secoc| secoc.profile == Profile::Announcement)?;
     OutputMessage::new(database, name, &[], faults)
 }
 
-/// Name of a signal and the function that returns its value.
 type SignalValue<T> = (&'static str, fn(&T) -> Option<f64>);
 
 fn value_of<T>(signals: &[SignalValue<T>], fields: &T, place: Option<usize>) -> Option<f64> {

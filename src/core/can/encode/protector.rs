@@ -1,8 +1,7 @@
-//! Protects generated input frames (CSV replay, simulator): the sender's side of end-to-end protection.
+//! Protects generated input frames (CSV replay, simulator) as a sender with end-to-end protection does.
 //!
-//! In: frames in the order in which they are sent. Each frame of a protected message gets the next counter and its CRC.
-//! Other frames are unchanged. A frame that is too short for the header is also unchanged; the receiver detects the
-//! fault.
+//! In: frames in sending order. Each frame of a protected message gets the next counter and its CRC. Other frames are
+//! unchanged, also frames that are too short for the header.
 
 use crate::can::e2e::Protection;
 use crate::can::guard::GuardConfig;
@@ -24,7 +23,7 @@ struct MessageSender {
 }
 
 impl InputProtector {
-    /// Creates the protector for the messages that `guards` check. Every counter starts at 0.
+    /// Creates a protector whose counters start at 0.
     pub fn new(guards: &[GuardConfig]) -> Self {
         let sender = |guard: &GuardConfig| MessageSender {
             bus: guard.bus,
@@ -35,7 +34,7 @@ impl InputProtector {
         Self { senders: guards.iter().map(sender).collect() }
     }
 
-    /// Protects the frames of protected messages.
+    /// Adds counter and CRC to the frames of protected messages.
     pub fn protect(&mut self, frames: &mut [(BusIndex, Frame)]) {
         if self.senders.is_empty() {
             return;

@@ -1,8 +1,8 @@
 //! Encodes the reply to a command frame.
 //!
 //! In: the outcome of a command or the reason for its refusal, and the counter that the next command must have. Out:
-//! the frame `PACKWATCH_Reply`. If the checksum, the authenticator or the freshness of a command frame is wrong, the
-//! caller sets [`ReplyFields::command`] to `None`, so that the reply does not show the received command.
+//! the frame `PACKWATCH_Reply`. If checksum, authenticator or freshness is wrong, the caller sets
+//! [`ReplyFields::command`] to `None`, so that the reply does not repeat the received command.
 
 use serde::{Deserialize, Serialize};
 
@@ -21,29 +21,28 @@ const REQUIRED: [&str; 9] =
 #[serde(rename_all = "snake_case")]
 #[repr(u8)]
 pub enum CommandRefusal {
-    /// The first frame after a start of the receiver, which only sets the counter.
+    /// The first frame after a start only sets the counter.
     FirstFrame = 1,
-    /// The frame is damaged, too short, or from another message.
+    /// Damaged, too short, or from another message.
     WrongChecksum = 2,
-    /// The counter was already used by the last accepted frame.
+    /// The last accepted frame had the same counter.
     RepeatedCounter = 3,
     /// The counter jumped further than allowed.
     WrongCounter = 4,
     /// The frame has an undefined code.
     NoMeaning = 5,
-    /// The authenticator is wrong: the frame is forged, or its sender has another key.
+    /// The frame is forged, or its sender has another key.
     NotAuthentic = 8,
-    /// The frame's freshness value is not accepted: it has already been used, it has expired, or packwatch has not
-    /// announced it yet. A value has been used if packwatch has accepted this value or a higher one. A value has
-    /// expired if it is below the previous announcement.
+    /// The freshness was already used, has expired, or was not announced yet. A value counts as used if this value or a
+    /// higher one was accepted. A value has expired if it is below the previous announcement.
     OldFreshness = 9,
-    /// The frame is authentic, but many forged frames were received. If the sender soon repeats the command with
-    /// another freshness, the command is executed.
+    /// Authentic, but many forged frames were received. The command is executed if the sender soon repeats it with
+    /// another freshness.
     RepeatNeeded = 10,
 }
 
 impl CommandRefusal {
-    /// The reason why a frame with this end-to-end status is not executed; `None` = the frame may be executed.
+    /// The reason to refuse a frame with this status; `None` = the frame may be executed.
     pub const fn of(status: Status) -> Option<Self> {
         match status {
             Status::Ok | Status::OkSomeLost | Status::Sync => None,
@@ -54,7 +53,7 @@ impl CommandRefusal {
         }
     }
 
-    /// Whether the frame's checksum, or its authenticator and freshness, were correct.
+    /// Whether checksum, authenticator and freshness were correct.
     pub const fn is_intact(self) -> bool {
         !matches!(self, Self::WrongChecksum | Self::NotAuthentic | Self::OldFreshness)
     }
@@ -77,18 +76,17 @@ impl CommandRefusal {
 /// Contents of the reply.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ReplyFields {
-    /// Number of changed alarms and number of alarms that refused the change, or the reason why the command was not
-    /// executed.
+    /// Numbers of changed alarms and of alarms that refused the change, or the reason why the command was not executed.
     pub outcome: Result<(u32, u32), CommandRefusal>,
-    /// The command; `None` = the command could not be decoded, or its frame is not intact.
+    /// `None` = the command could not be decoded, or its frame is not intact.
     pub command: Option<CommandFields>,
-    /// Counter that the next command must have; `None` = any counter.
+    /// `None` = any counter.
     pub counter_expected: Option<u8>,
 }
 
 impl ReplyFields {
-    /// Codes of `Result` (1 accepted, 2 refused) and `Reason` (in addition to [`CommandRefusal`]: 0 none, 6 not
-    /// healthy, 7 nothing to do).
+    /// Wire codes of `Result` (1 accepted, 2 refused) and `Reason` ([`CommandRefusal`], 0 none, 6 not healthy, 7
+    /// nothing to do).
     fn result(&self) -> (u8, u8) {
         let replaces_pack = self.command.is_some_and(|fields| fields.command == Command::PackReplaced);
         match self.outcome {
@@ -122,7 +120,7 @@ impl ReplyFields {
     }
 }
 
-/// Prepares the reply message; `None` = the database has none, or faults were added to `faults`.
+/// Prepares the reply message; `None` = the database has no reply, or faults were added to `faults`.
 pub(super) fn reply_message(database: &Database, faults: &mut Vec<String>) -> Option<OutputMessage> {
     let name = LayoutMessage::Reply.message();
     database.message(name)?;

@@ -28,7 +28,7 @@ fn damaged() -> Frame {
     Frame::classic(ID, &[0; 8]).unwrap()
 }
 
-/// The moment `tenths` tenths of a period after the start.
+/// A time in tenths of a period after the start.
 fn at(tenths: i64) -> Timestamp {
     Timestamp::from_nanos(1_700_000_000_000_000_000 + tenths * PERIOD_NS / 10)
 }

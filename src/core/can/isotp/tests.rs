@@ -12,7 +12,7 @@ fn at(ms: i64) -> Timestamp {
 
 type Harm = fn(&mut Vec<Vec<u8>>);
 
-/// Receives payloads of one sender at intervals of a millisecond; returns the messages and faults.
+/// Receives a payload every millisecond. Returns messages and faults.
 fn receive(extension: Option<u8>, payloads: &[Vec<u8>]) -> (Vec<Vec<u8>>, Vec<IsoTpFault>) {
     let mut receiver = Receiver::new(extension);
     let (mut messages, mut faults) = (Vec::new(), Vec::new());
@@ -36,7 +36,7 @@ fn message(length: usize) -> Vec<u8> {
 
 #[test]
 fn leaf_response_is_reassembled() {
-    // Frames from the log of a 2019 Leaf: group 1 of service 0x21, 53 bytes (0x35).
+    // From the log of a 2019 Leaf: group 1 of service 0x21, 53 bytes (0x35).
     let frames: Vec<Vec<u8>> = [
         [0x10, 0x35, 0x61, 0x01, 0xFF, 0xFF, 0xF3, 0xCC],
         [0x21, 0x02, 0xAF, 0xFF, 0xFF, 0xEB, 0xA6, 0xFF],
@@ -112,7 +112,7 @@ fn refusing_flow_control_ends_message() {
 
 #[test]
 fn can_fd_frames_are_reassembled() {
-    // A single frame of 20 bytes with a length escape, and a message of 100 bytes in frames of 64.
+    // 20 bytes with a length escape, and 100 bytes in frames of 64.
     let single = [&[0x00, 20][..], &message(20), &[0xCC; 2]].concat();
     let long = message(100);
     let first = [&[0x10, 100][..], &long[..62]].concat();
@@ -141,14 +141,13 @@ proptest! {
         prop_assert_eq!(receive(extension, &frames), (vec![message(length)], vec![]));
     }
 
-    /// One frame of a message is lost, duplicated or out of order. Every accepted message must have been sent, and
-    /// every message that arrives intact must be accepted. (If the end of one message replaces the start of the next,
-    /// the protocol itself cannot detect a fault.)
+    /// One frame is lost, duplicated or out of order. Frames of different messages are never swapped, because the
+    /// protocol cannot detect this fault.
     #[test]
     fn damaged_messages_are_never_accepted(
         lengths in proptest::collection::vec(1_usize..80, 1..20), place in any::<proptest::sample::Index>(), kind in 0..3_u8
     ) {
-        // Each message has its own bytes, so that a mixture is visible.
+        // Each message has its own byte value.
         let sent: Vec<Vec<u8>> = (0_u8..).zip(&lengths).map(|(tag, &length)| vec![tag; length]).collect();
         let mut frames: Vec<(usize, Vec<u8>)> =
             sent.iter().enumerate().flat_map(|(n, m)| payloads(m).into_iter().map(move |p| (n, p))).collect();

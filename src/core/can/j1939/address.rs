@@ -1,6 +1,5 @@
-//! State machine of the node's J1939 address (J1939-81): the node claims the address, defends it, and falls silent if
-//! another node takes the address. If two nodes claim the same address, the node with the lower NAME (a 64-bit
-//! identity) wins.
+//! State machine of the node's J1939 address (J1939-81). If two nodes claim the same address, the node with the lower
+//! NAME (a 64-bit identity) wins, and the other node falls silent.
 //!
 //! | state | started | lower or equal NAME claims | higher NAME claims | request for claims | 300 ms passed |
 //! | --- | --- | --- | --- | --- | --- |
@@ -9,11 +8,11 @@
 //! | claimed | claiming; claim | lost; cannot claim | claimed; claim | claimed; claim | - |
 //! | lost | claiming; claim | - | - | lost; cannot claim | - |
 //!
-//! Each cell contains the next state and, after the semicolon, the frame that the node sends; "-" = no effect.
+//! A cell contains the next state and, after the semicolon, the frame that the node sends; "-" = no effect.
 //!
-//! An equal NAME belongs to a second node with the same configuration. Arbitration cannot separate the two nodes, and
-//! their broadcasts from one address would corrupt each other. Therefore a node that receives its own NAME falls
-//! silent. (A socket does not receive its own frames.)
+//! An equal NAME belongs to a second node with the same configuration. Arbitration cannot separate these nodes, and
+//! their broadcasts would corrupt each other. Therefore, a node that receives its own NAME falls silent. (A socket does
+//! not receive its own frames.)
 
 use serde::{Deserialize, Serialize};
 
@@ -23,16 +22,14 @@ use super::name::Name;
 use crate::can::Frame;
 use crate::quantity::Timestamp;
 
-/// If no other node objects within this time (ns), the node has the address. J1939-81 specifies 250 ms. The additional
-/// 50 ms are needed because a frame reaches the bus later than its time stamp (interface start, queues). A delay of 12
-/// ms was measured.
+/// If no other node objects within this time (ns), the node has the address. J1939-81 specifies 250 ms. 50 ms are
+/// added, because a frame reaches the bus later than its time stamp (12 ms were measured).
 const CONTENTION_NS: i64 = 300_000_000;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) enum ClaimState {
-    /// The node has not started.
     Idle,
-    /// The node waits for objections to its claim.
+    /// Waits for objections.
     Claiming,
     Claimed,
     Lost,
@@ -40,15 +37,11 @@ pub(super) enum ClaimState {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum ClaimEvent {
-    /// The program starts, or resumes after a time without listening.
+    /// Also after a time without listening.
     Started,
-    /// A lower or equal NAME claims the address.
     ClaimedByStronger,
-    /// A higher NAME claims the address.
     ClaimedByWeaker,
-    /// A node requests address claims.
     Requested,
-    /// No node objected during the contention time.
     Unopposed,
 }
 
@@ -59,7 +52,7 @@ enum ClaimAnswer {
     CannotClaim,
 }
 
-/// The new state and the answer, as in the table in the module's documentation.
+/// As in the table above.
 fn next(state: ClaimState, event: ClaimEvent) -> (ClaimState, ClaimAnswer) {
     match (state, event) {
         (ClaimState::Idle | ClaimState::Claiming | ClaimState::Claimed | ClaimState::Lost, ClaimEvent::Started)
@@ -88,12 +81,12 @@ pub(super) struct AddressClaim {
     name: Name,
     address: u8,
     pub(super) state: ClaimState,
-    /// End of the contention time, in state `Claiming`.
+    /// End of the contention time.
     unopposed_at: Timestamp,
-    /// When to send a claim (in state `Lost`: "cannot claim").
+    /// Time of the next claim or "cannot claim".
     send_at: Option<Timestamp>,
     last_sent: Option<Timestamp>,
-    /// Whether the first claim, which starts the contention time, still has to be sent.
+    /// Whether the first claim, which starts the contention time, was not sent yet.
     is_first: bool,
 }
 
@@ -110,12 +103,11 @@ impl AddressClaim {
         }
     }
 
-    /// Whether `self` and `other` claim the same address for the same NAME.
     pub(super) fn is_same(&self, other: &Self) -> bool {
         (self.name, self.address) == (other.name, other.address)
     }
 
-    /// Starts the claim, or restarts it after a time without listening.
+    /// Also restarts the claim after a time without listening.
     pub(super) fn start(&mut self, now: Timestamp) {
         self.last_sent = None;
         self.send_at = None;
@@ -123,13 +115,12 @@ impl AddressClaim {
         self.handle(now, ClaimEvent::Started);
     }
 
-    /// Handles another node's claim of the address.
     pub(super) fn contend(&mut self, now: Timestamp, by: Name) -> Option<NodeEvent> {
         let (before, was_answered) = (self.state, self.send_at.is_none());
         self.handle(now, if by <= self.name { ClaimEvent::ClaimedByStronger } else { ClaimEvent::ClaimedByWeaker });
         match (before, self.state) {
             (ClaimState::Claiming | ClaimState::Claimed, ClaimState::Lost) => Some(NodeEvent::AddressLost { to: by }),
-            // One event per response, because a flood of claims is answered at a limited rate.
+            // One event per answer, because a flood of claims is answered at a limited rate.
             (ClaimState::Claiming | ClaimState::Claimed, ClaimState::Claiming | ClaimState::Claimed) => {
                 was_answered.then_some(NodeEvent::AddressDefended { against: by })
             }
@@ -145,32 +136,33 @@ impl AddressClaim {
         let before = self.state;
         let (state, answer) = next(before, event);
         self.state = state;
-        // Shortest time between two claims, ns. Five claims still fit into the 250 ms that the other node waits. A
-        // flood of claims from another node does not cause a flood of responses.
+        // At least 50 ms (in ns) between two claims, so that a flood of claims is not answered by a flood. Five claims
+        // still fit into the 250 ms that the other node waits.
         let spaced = self.last_sent.map_or(now, |sent| now.max(sent.plus_nanos(50_000_000)));
         match answer {
             ClaimAnswer::Nothing => {}
             ClaimAnswer::Claim => self.send_at = Some(self.send_at.map_or(spaced, |due| due.min(spaced))),
-            // A frame that is already due in state `Lost` is a "cannot claim": keep its time.
+            // A frame that is due in state `Lost` is a "cannot claim". Keep its time.
             ClaimAnswer::CannotClaim if before == ClaimState::Lost && self.send_at.is_some() => {}
             ClaimAnswer::CannotClaim => self.send_at = Some(spaced.plus_nanos(self.loser_delay_ns())),
         }
-        // Only the start restarts the contention time: requests and weaker claims must not keep the node silent.
+        // Only the start restarts the contention time, because requests and weaker claims must not keep the node
+        // silent.
         if event == ClaimEvent::Started {
             self.unopposed_at = now.plus_nanos(CONTENTION_NS);
         }
     }
 
-    /// Delay before "cannot claim". It is derived from the NAME, so that it is the same in every run and most likely
-    /// different for two nodes.
+    /// Delay before "cannot claim", ns. It follows from the NAME, so that it is the same in every run and differs
+    /// between most nodes.
     fn loser_delay_ns(&self) -> i64 {
         // Fibonacci hashing: consecutive serial numbers give very different delays.
         let mixed = self.name.raw().wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 32;
-        // 0 to 153 ms, so that several nodes without address do not send equal identifiers at the same time (J1939-81).
+        // 0 to 153 ms, so that nodes without address do not send equal identifiers at the same time (J1939-81).
         1_000_000 * i64::try_from(mixed % 154).unwrap_or(0)
     }
 
-    /// Returns the frame that is due, or the event that the node has the address.
+    /// Returns the frame that is due, or reports that the node has the address.
     pub(super) fn poll(&mut self, now: Timestamp) -> (Option<Frame>, Option<NodeEvent>) {
         if let Some(due) = self.send_at {
             if now < due {
@@ -199,7 +191,6 @@ impl AddressClaim {
         Frame::classic(can_id(PRIORITY, PGN_ADDRESS_CLAIMED, GLOBAL_ADDRESS, source), &self.name.to_bytes())
     }
 
-    /// Time at which `poll` must be called next.
     pub(super) fn next_due(&self) -> Option<Timestamp> {
         self.send_at.or((self.state == ClaimState::Claiming).then_some(self.unopposed_at))
     }

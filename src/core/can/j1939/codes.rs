@@ -1,20 +1,18 @@
 //! Limits each sent trouble code to one change a second (J1939-73).
 //!
-//! A code is added to the message as soon as it becomes active, and removed as soon as it becomes inactive. If the
-//! code's last change on the bus is less than a second ago, the new change waits. If the code was active only while a
-//! change waited, it is still sent for at least a second. If the code was inactive only while a change waited, it stays
-//! in the message with a higher count.
+//! A code is added to the message when it becomes active, and removed when it becomes inactive. If the code's last
+//! change on the bus is less than a second ago, the new change waits. If the code was active only during this wait, it
+//! is still sent for at least a second. If the code was inactive only during this wait, it stays in the message with a
+//! higher count.
 //!
-//! The state "all values are known" follows the same rule when it becomes true. When it becomes false, the change is
-//! sent at once.
+//! The state "all values are known" also waits when it becomes true. When it becomes false, the change is sent at once.
 
 use serde::{Deserialize, Serialize};
 
 use super::trouble_code::{Lamp, Lamps, TroubleCode};
 use crate::quantity::Timestamp;
 
-/// Maximum number of codes whose state is followed. It is more than a configuration can have (18 rules with three
-/// severities give 54) and small enough for a linear search.
+/// More than a configuration can have (18 rules with three severities give 54), and few enough for a linear search.
 const MAX_FOLLOWED: usize = 64;
 
 /// An active code and its lamp.
@@ -24,25 +22,23 @@ pub struct ActiveCode {
     pub lamp: Lamp,
 }
 
-/// A code that is or was active, with its present state and its state on the bus.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 struct FollowedCode {
     code: TroubleCode,
     is_active: bool,
-    /// Whether the code became active while it was not on the bus, and has not been sent since.
+    /// Whether the code became active while it was not on the bus, and has not been sent since then.
     is_unseen: bool,
-    /// Lamp to send: the present lamp, or a more severe lamp that the code had and that has not been sent yet.
+    /// Lamp to send: the present lamp, or a more severe lamp that was not sent yet.
     lamp: Lamp,
     lamp_now: Lamp,
-    /// Lamp on the bus; `None` = the code is not sent.
+    /// `None` = the code is not sent.
     shown: Option<Lamp>,
     changed_at: Option<Timestamp>,
-    /// Whether the latest change is part of a message that is still being transferred.
+    /// Whether the latest change is in a message that is still being transferred.
     is_in_flight: bool,
 }
 
 impl FollowedCode {
-    /// Creates the state of a code that has just become active.
     fn new(active: &ActiveCode) -> Self {
         Self {
             code: active.code,
@@ -60,18 +56,18 @@ impl FollowedCode {
         (self.is_active || self.is_unseen).then_some(self.lamp)
     }
 
-    /// Time of the next change on the bus; `None` = no change.
+    /// `None` = no change.
     fn due(&self) -> Option<Timestamp> {
         (self.wanted() != self.shown).then_some(spaced(self.changed_at))
     }
 
-    /// The lamp in a message that is sent at `now`; `None` = the message does not contain the code.
+    /// The lamp in a message sent at `now`; `None` = the message lacks the code.
     fn shown_at(&self, now: Timestamp) -> Option<Lamp> {
         if self.due().is_some_and(|due| due <= now) { self.wanted() } else { self.shown }
     }
 
     fn activate(&mut self, active: &ActiveCode) {
-        // If the list contains the code twice, use the more severe lamp and the higher count.
+        // If the list contains the code twice, the more severe lamp and the higher count apply.
         let (lamp_before, count_before) = match self.is_active {
             true => (self.lamp_now, self.code.occurrence_count()),
             false => (Lamp::None, 0),
@@ -82,7 +78,7 @@ impl FollowedCode {
         self.code = active.code.with_occurrences(active.code.occurrence_count().max(count_before).into());
     }
 
-    /// Updates the lamp after a new list: keeps the most severe lamp that was not sent yet.
+    /// Keeps a more severe lamp that has not been sent yet.
     fn settle_lamp(&mut self) {
         if self.is_active {
             let is_unseen = self.shown.is_none_or(|shown| self.lamp > shown);
@@ -91,9 +87,8 @@ impl FollowedCode {
     }
 }
 
-/// Earliest time of the next change.
 fn spaced(changed_at: Option<Timestamp>) -> Timestamp {
-    // Shortest time between two changes of one code on the bus, ns.
+    // At least 1 s (in ns) between two changes of a code on the bus.
     changed_at.map_or(Timestamp::from_nanos(i64::MIN), |changed| changed.plus_nanos(1_000_000_000))
 }
 
@@ -106,7 +101,7 @@ pub(super) struct Codes {
 }
 
 impl Codes {
-    /// Handles a list of active codes; follows at most [`MAX_FOLLOWED`] codes.
+    /// Follows at most [`MAX_FOLLOWED`] codes.
     pub(super) fn set(&mut self, now: Timestamp, active: &[ActiveCode], all_known: bool) {
         self.forget_settled(now);
         self.all_known = all_known;
@@ -125,7 +120,7 @@ impl Codes {
         }
     }
 
-    /// Removes codes that are inactive and no longer sent.
+    /// Removes codes that are inactive and not sent.
     fn forget_settled(&mut self, now: Timestamp) {
         self.followed.retain(|f| {
             let is_settled = f.wanted().is_none() && f.shown.is_none() && !f.is_in_flight;
@@ -133,7 +128,6 @@ impl Codes {
         });
     }
 
-    /// Treats all active codes as new. Called after a time without the bus.
     pub(super) fn restart(&mut self) {
         self.followed.retain(|followed| followed.is_active);
         for followed in &mut self.followed {
@@ -143,7 +137,7 @@ impl Codes {
         self.known_changed_at = None;
     }
 
-    /// Time of the next change; `None` = all changes are sent.
+    /// `None` = all changes are sent.
     pub(super) fn change_due(&self) -> Option<Timestamp> {
         let known = match (self.all_known, self.all_known_shown) {
             (true, true) | (false, false) => None,
@@ -153,17 +147,16 @@ impl Codes {
         self.changes().chain(known).min()
     }
 
-    /// Time of each waiting change.
     pub(super) fn changes(&self) -> impl Iterator<Item = Timestamp> {
         self.followed.iter().filter_map(FollowedCode::due)
     }
 
-    /// Number of codes in a message that is sent at `now`.
+    /// Number of codes in a message sent at `now`.
     pub(super) fn count_at(&self, now: Timestamp) -> usize {
         self.followed.iter().filter(|followed| followed.shown_at(now).is_some()).count()
     }
 
-    /// Applies every due change to the message that is built at `now`.
+    /// Applies every due change to a message built at `now`.
     pub(super) fn show(&mut self, now: Timestamp) {
         for followed in &mut self.followed {
             if followed.due().is_some_and(|due| due <= now) {
@@ -180,8 +173,7 @@ impl Codes {
         }
     }
 
-    /// Handles the end of a message at `now`. From then on, each code that the message changed stays unchanged on the
-    /// bus for one second.
+    /// Handles the end of a message. The codes that the message changed then stay unchanged on the bus for a second.
     pub(super) fn sent(&mut self, now: Timestamp) {
         for followed in self.followed.iter_mut().filter(|followed| followed.is_in_flight) {
             followed.changed_at = Some(now);
@@ -189,12 +181,11 @@ impl Codes {
         }
     }
 
-    /// The lamps to send, including the lamps of codes that do not fit into the message.
+    /// Includes the lamps of codes that do not fit into the message.
     pub(super) fn lamps(&self) -> Lamps {
         Lamps::of(self.followed.iter().filter_map(|followed| followed.shown), self.all_known_shown)
     }
 
-    /// The codes to send, ordered by lamp (most severe first), then by number.
     pub(super) fn shown(&self) -> Vec<TroubleCode> {
         let mut shown: Vec<(Lamp, TroubleCode)> =
             self.followed.iter().filter_map(|followed| Some((followed.shown?, followed.code))).collect();
@@ -216,7 +207,7 @@ mod tests {
         ActiveCode { code: TroubleCode::new(spn, 31, count).unwrap(), lamp }
     }
 
-    /// Sets the active codes and sends a message; returns its codes.
+    /// Sets the active codes and sends a message. Returns the codes of the message.
     fn step(codes: &mut Codes, ms: i64, now_active: &[ActiveCode]) -> Vec<u32> {
         codes.set(at(ms), now_active, true);
         codes.show(at(ms));

@@ -4,7 +4,7 @@ use crate::can::CanId;
 
 /// Requests a parameter group from one address or from all.
 pub const PGN_REQUEST: u32 = 59_904;
-/// Acknowledges a request; this node sends only negative acknowledgements.
+/// Acknowledges a request. This node sends only negative acknowledgements.
 pub const PGN_ACKNOWLEDGEMENT: u32 = 59_392;
 /// Claims an address. Sent from [`NULL_ADDRESS`], it means "cannot claim".
 pub const PGN_ADDRESS_CLAIMED: u32 = 60_928;
@@ -29,17 +29,16 @@ pub(super) const PRIORITY: u8 = 6;
 /// Default priority of the transport protocol: the lowest, because a transfer takes many frames.
 pub(super) const TRANSPORT_PRIORITY: u8 = 7;
 
-/// Mask of the identifier without the priority.
 pub(super) const WITHOUT_PRIORITY: u32 = 0x03FF_FFFF;
-/// First PDU format without a destination; its PDU-specific byte belongs to the PGN.
+/// First PDU format without a destination. Its PDU-specific byte belongs to the PGN.
 const FIRST_BROADCAST_FORMAT: u8 = 240;
 
-/// Parts of an identifier, without the priority.
+/// An identifier without its priority.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Header {
-    /// Parameter group number, 18 bits.
+    /// 18 bits.
     pub(super) pgn: u32,
-    /// Receiver; [`GLOBAL_ADDRESS`] for a group without destination.
+    /// [`GLOBAL_ADDRESS`] for a group without destination.
     pub(super) destination: u8,
     pub(super) source: u8,
 }
@@ -59,12 +58,11 @@ impl Header {
 pub(super) fn can_id(priority: u8, pgn: u32, destination: u8, source: u8) -> CanId {
     let [_, page, format, low] = pgn.to_be_bytes();
     let specific = if format < FIRST_BROADCAST_FORMAT { destination } else { low };
-    // The priority has 3 bits and the page has 2 bits. The masks change nothing, because callers pass values that fit.
+    // The masks change nothing, because callers pass 3 bits of priority and 2 bits of page.
     CanId::Extended(u32::from_be_bytes([((priority & 7) << 2) | (page & 3), format, specific, source]))
 }
 
-/// Identifier and mask of one group from any source with any priority. `destination` is used only for groups with a
-/// destination.
+/// Identifier and mask of a group from any source with any priority.
 pub(super) fn filter(pgn: u32, destination: u8) -> (u32, u32) {
     (can_id(0, pgn, destination, 0).raw(), WITHOUT_PRIORITY & !0xFF)
 }
@@ -79,18 +77,16 @@ pub(crate) fn has_destination(pgn: u32) -> bool {
     pgn >> 8 & 0xFF < u32::from(FIRST_BROADCAST_FORMAT)
 }
 
-/// Identifier and mask of one group without a destination, from any source with any priority.
+/// Identifier and mask of a group without a destination.
 pub(crate) fn any_source(pgn: u32) -> (u32, u32) {
     filter(pgn, 0)
 }
 
-/// A PGN in a payload: three bytes, lowest first.
 pub(super) fn pgn_bytes(pgn: u32) -> [u8; 3] {
     let [low, middle, high, _] = pgn.to_le_bytes();
     [low, middle, high]
 }
 
-/// The PGN from three payload bytes.
 pub(super) fn pgn_of(bytes: [u8; 3]) -> u32 {
     u32::from_le_bytes([bytes[0], bytes[1], bytes[2], 0])
 }

@@ -1,7 +1,7 @@
 //! J1939: packwatch is a node that claims an address and sends trouble codes.
 //!
-//! In: times, received frames and active codes. Out: frames to send and events to log. Like the rest of
-//! [`can`](crate::can), the module is pure: the output depends only on the input, so a replay gives the same frames.
+//! In: times, received frames and active codes. Out: frames to send and events to log. The output depends only on the
+//! input, so a replay gives the same frames.
 //!
 //! | file | purpose |
 //! | --- | --- |
@@ -14,15 +14,14 @@
 //! | `event` | events of the node |
 //! | `node` | the node that consists of these parts |
 //!
-//! While the node does not have its address, it sends only address claims. It ignores unknown and short frames and
-//! answers requests at a limited rate. No input causes a panic.
+//! While the node has no address, it sends only address claims. It ignores unknown and short frames and answers
+//! requests at a limited rate.
 //!
 //! Deviations from the standard:
-//! 1. The arbitrary address capability is not used: a node that loses its address falls silent instead of claiming
-//!    another address. If addresses changed, a consumer that identifies battery monitors by address could not
-//!    distinguish them.
-//! 2. Every payload of more than 8 bytes is sent by BAM, even if a single node requested it (for a single node, the
-//!    standard uses a connection with flow control). That node also receives the broadcast, but cannot request a lost
+//! 1. A node that loses its address falls silent instead of claiming another address. If addresses changed, a consumer
+//!    that identifies battery monitors by address could not distinguish them.
+//! 2. Every payload of more than 8 bytes is broadcast (BAM), even if a single node requested it. For a single node, the
+//!    standard uses a connection with flow control. This node also receives the broadcast, but cannot request a lost
 //!    packet again. [`MAX_CODES`] limits the length of a broadcast.
 //! 3. The delay before "cannot claim" is derived from the NAME instead of being random, so that a replay gives the same
 //!    frames.

@@ -12,23 +12,23 @@ pub struct Name(u64);
 /// Fields of a NAME.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct NameFields {
-    /// Whether the node claims another address after losing its own. packwatch never does.
+    /// packwatch never claims another address after losing its own.
     pub arbitrary_address_capable: bool,
-    /// 0 global, 1 on-highway, 2 agriculture, 3 construction, 4 marine, 5 industrial; 3 bits.
+    /// 3 bits: 0 global, 1 on-highway, 2 agriculture, 3 construction, 4 marine, 5 industrial.
     pub industry_group: u8,
-    /// Instance among equal vehicle systems; 4 bits.
+    /// 4 bits.
     pub vehicle_system_instance: u8,
-    /// Vehicle system within the industry group; 7 bits, 127 = not available.
+    /// 7 bits, 127 = not available.
     pub vehicle_system: u8,
-    /// Function; 8 bits, 255 = not available.
+    /// 8 bits, 255 = not available.
     pub function: u8,
-    /// Instance among nodes with this function; 5 bits.
+    /// 5 bits.
     pub function_instance: u8,
-    /// Instance among ECUs that share a function; 3 bits.
+    /// 3 bits.
     pub ecu_instance: u8,
-    /// Manufacturer, assigned by SAE; 11 bits.
+    /// 11 bits, assigned by SAE.
     pub manufacturer_code: u16,
-    /// Serial number, unique for the manufacturer; 21 bits.
+    /// 21 bits, unique for the manufacturer.
     pub identity_number: u32,
 }
 
@@ -36,20 +36,14 @@ pub struct NameFields {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("{field} = {found}, must be {lowest} to {highest}")]
 pub struct OutOfRange {
-    /// Name of the number.
     pub field: &'static str,
     pub found: u64,
-    /// Smallest allowed value.
     pub lowest: u64,
-    /// Largest allowed value.
     pub highest: u64,
 }
 
 impl Name {
-    /// Builds a NAME from its fields.
-    ///
-    /// # Errors
-    /// The first field that does not fit its bits.
+    /// Builds a NAME. Fails at the first field that does not fit its bits.
     pub fn new(fields: &NameFields) -> Result<Self, OutOfRange> {
         // From the lowest bit up, as in J1939-81, table 1.
         let parts: [(&'static str, u64, u32); 10] = [
@@ -81,7 +75,7 @@ impl Name {
         Self(u64::from_le_bytes(bytes))
     }
 
-    /// The bytes to send, lowest first.
+    /// The bytes, lowest first.
     pub const fn to_bytes(self) -> [u8; 8] {
         self.0.to_le_bytes()
     }

@@ -4,10 +4,10 @@
 //!   code changes.
 //! * DM2 is sent only on request.
 //! * Messages of more than 8 bytes are transferred one after the other, so a changed DM1 waits for the end of a
-//!   transfer. If a DM1 and a DM2 wait, they are sent alternately, so that neither a flood of requests stops DM1 nor a
-//!   long DM1 stops DM2. A single-frame DM1 is sent even while a DM2 is being transferred.
-//! * If a node requests a group that is not supported, the answer depends on the destination. A request to the node's
-//!   own address is rejected, and a request to all nodes is ignored.
+//!   transfer. If a DM1 and a DM2 wait, they are sent alternately, so that neither of them blocks the other. A
+//!   single-frame DM1 is sent even during the transfer of a DM2.
+//! * A request for an unsupported group is rejected if it is addressed to the node, and ignored if it is addressed to
+//!   all nodes.
 
 use std::collections::VecDeque;
 
@@ -26,17 +26,17 @@ use super::trouble_code::{DmPayload, TroubleCode, dm_payload};
 use crate::can::{CanId, Frame, FrameKind};
 use crate::quantity::Timestamp;
 
-/// Period of DM1, ns (J1939-73).
+/// Period of DM1 (J1939-73), ns.
 const DM1_PERIOD_NS: i64 = 1_000_000_000;
 /// Maximum number of pending responses. A fifth response could be sent more than 200 ms after its request, when the
-/// requester has given up (J1939-21).
+/// requester has already given up (J1939-21).
 const MAX_WAITING_ANSWERS: usize = 4;
 
 /// Identity of a node.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct NodeConfig {
     pub name: Name,
-    /// Claimed address, 0 to [`MAX_ADDRESS`](super::MAX_ADDRESS).
+    /// 0 to [`MAX_ADDRESS`](super::MAX_ADDRESS).
     pub address: u8,
 }
 
@@ -59,9 +59,7 @@ impl NodeConfig {
 /// Output of the node; the caller empties it.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct NodeOutputs {
-    /// Frames to send, in this order.
     pub frames: Vec<Frame>,
-    /// Events to log.
     pub events: Vec<NodeEvent>,
 }
 
@@ -115,7 +113,7 @@ impl Node {
         }
     }
 
-    /// Claims the address. If no other node objects, the node sends codes 300 ms later (`address` explains this time).
+    /// Claims the address. If no other node objects, codes are sent 300 ms later.
     pub fn start(&mut self, now: Timestamp, out: &mut NodeOutputs) {
         self.fall_silent();
         self.codes.restart();
@@ -125,9 +123,8 @@ impl Node {
         self.poll(now, out);
     }
 
-    /// Sets the codes that the next [`poll`](Self::poll) sends. The caller sorts `active` by severity (most severe code
-    /// first) and `previously_active` by time (latest code first). `all_known` says whether every value that could
-    /// activate a code is known.
+    /// Sets the codes to send. The caller sorts `active` by severity (most severe first) and `previously_active` by
+    /// time (latest first). `all_known` says whether every value that could activate a code is known.
     pub fn set_codes(
         &mut self,
         now: Timestamp,
@@ -165,7 +162,7 @@ impl Node {
         let &[low, middle, high, ..] = frame.data() else { return };
         let is_for_all = header.destination == GLOBAL_ADDRESS;
         let answer = match (pgn_of([low, middle, high]), self.claim.state) {
-            // After a loss, the address belongs to another node. Then only requests to all nodes concern this node.
+            // After a loss, another node has the address. Then only requests to all nodes concern this node.
             (PGN_ADDRESS_CLAIMED, ClaimState::Lost) if !is_for_all => return,
             (PGN_ADDRESS_CLAIMED, ClaimState::Idle | ClaimState::Claiming | ClaimState::Claimed | ClaimState::Lost) => {
                 return self.claim.handle_request(now);
@@ -176,7 +173,7 @@ impl Node {
             (_, ClaimState::Claimed) if is_for_all => return,
             (pgn, ClaimState::Claimed) => PendingAnswer::Refusal { pgn, to: header.source },
         };
-        // The response is a broadcast, so one response serves all requesters.
+        // One broadcast serves all requesters.
         if !self.answers.contains(&answer) && self.answers.len() < MAX_WAITING_ANSWERS {
             self.answers.push_back(answer);
         }
@@ -208,7 +205,7 @@ impl Node {
         let Some(transfer) = &mut self.transfer else { return };
         out.frames.extend(transfer.poll(now, self.address));
         if transfer.is_complete() {
-            // The next announcement also keeps the packet spacing.
+            // The next announcement must keep the packet spacing, too.
             self.transport_free_at = transfer.due;
             self.last_transferred = transfer.pgn;
             if transfer.pgn == PGN_DM1 {
@@ -235,8 +232,7 @@ impl Node {
         let is_cyclic = self.next_dm1 <= now;
         let has_changed = self.codes.change_due().is_some_and(|due| due <= now);
         if (is_cyclic || has_changed) && self.can_start(now, PGN_DM1) {
-            // If this DM1 is cyclic and less than a period late, the next DM1 keeps the cycle. Otherwise a new cycle
-            // starts now.
+            // A cyclic DM1 that is less than a period late keeps the cycle. Any other DM1 starts a new cycle.
             let next = self.next_dm1.plus_nanos(DM1_PERIOD_NS);
             self.next_dm1 = if is_cyclic && now < next { next } else { now.plus_nanos(DM1_PERIOD_NS) };
             self.send_dm1(now, out);
@@ -253,15 +249,15 @@ impl Node {
             PendingAnswer::Refusal { .. } => true,
         });
         let Some(answer) = ready.and_then(|index| self.answers.remove(index)) else { return };
-        // Shortest time (ns) between two responses to requests. A flood of requests therefore causes at most 20
-        // responses a second.
+        // At least 50 ms (in ns) between two responses, so that a flood of requests causes at most 20 responses a
+        // second.
         self.next_answer_at = now.plus_nanos(50_000_000);
         match answer {
             PendingAnswer::Dm1 => self.send_dm1(now, out),
             PendingAnswer::Dm2 => self.send(now, PGN_DM2, dm_payload(self.codes.lamps(), &self.previously_active), out),
             PendingAnswer::Refusal { pgn, to } => {
                 let [low, middle, high] = pgn_bytes(pgn);
-                // Control byte of a negative acknowledgement.
+                // 1 = negative acknowledgement.
                 let refusal = [1, 0xFF, 0xFF, 0xFF, to, low, middle, high];
                 let id = can_id(PRIORITY, PGN_ACKNOWLEDGEMENT, GLOBAL_ADDRESS, self.address);
                 out.frames.extend(Frame::classic(id, &refusal));
@@ -293,12 +289,11 @@ impl Node {
         }
     }
 
-    /// Whether a pending DM2 goes first, because a DM1 was transferred last.
+    /// Whether a pending DM2 goes first, because the last transfer was a DM1.
     fn is_turn_of_dm2(&self) -> bool {
         self.last_transferred == PGN_DM1 && self.answers.contains(&PendingAnswer::Dm2)
     }
 
-    /// Whether a message of this group can be sent now.
     fn can_start(&self, now: Timestamp, pgn: u32) -> bool {
         self.start_at(now, pgn).is_some_and(|start| start <= now)
     }
@@ -317,8 +312,8 @@ impl Node {
         }
     }
 
-    /// Time at which [`poll`](Self::poll) must be called next; a time in the past means now. `None` = only after a
-    /// frame or [`start`](Self::start). A poll before this time does nothing.
+    /// Time of the next [`poll`](Self::poll), which may be in the past. `None` = only after a frame or
+    /// [`start`](Self::start). An earlier poll does nothing.
     pub fn next_due(&self) -> Option<Timestamp> {
         let claim = self.claim.next_due();
         if self.is_silent() {
@@ -335,20 +330,20 @@ impl Node {
         claim.into_iter().chain(transfer).chain(dm1).chain(answers).min()
     }
 
-    /// Earliest time at which a message of this group can be sent if it is due at `wanted`.
+    /// Like `start_at`, for a message that is due at `wanted`.
     fn startable_from(&self, pgn: u32, wanted: Timestamp) -> Option<Timestamp> {
         let from = wanted.max(self.polled_at);
         let start = self.start_at(from, pgn).map(|start| start.max(wanted));
         if pgn != PGN_DM1 || start.is_some_and(|start| start <= from) {
             return start;
         }
-        // When codes leave the message, the message may become short enough to be sent during a transfer or during the
-        // pause after the transfer.
+        // When codes leave the message, the message may become short enough to be sent during a transfer or the
+        // following pause.
         let shorter = self.codes.changes().filter(|&change| change > from);
         shorter.filter_map(|change| self.start_at(change, pgn).map(|start| start.max(change))).chain(start).min()
     }
 
-    /// Whether the node may send only address claims, because it does not have its address.
+    /// Whether the node has no address and may send only claims.
     pub fn is_silent(&self) -> bool {
         match self.claim.state {
             ClaimState::Idle | ClaimState::Claiming | ClaimState::Lost => true,
@@ -356,8 +351,8 @@ impl Node {
         }
     }
 
-    /// Identifiers and masks of the extended frames that the node must receive, for any priority. These are claims of
-    /// the node's address, requests to the node, and requests to all nodes.
+    /// Identifiers and masks of the frames to receive, for any priority: claims of the address, requests to the node,
+    /// and requests to all nodes.
     pub fn wanted(&self) -> [(u32, u32); 3] {
         let (claim, mask) = filter(PGN_ADDRESS_CLAIMED, GLOBAL_ADDRESS);
         [
@@ -367,7 +362,6 @@ impl Node {
         ]
     }
 
-    /// Drops the transfer and the pending responses.
     fn fall_silent(&mut self) {
         self.transfer = None;
         self.answers.clear();

@@ -1,7 +1,7 @@
 //! Broadcasts a payload of more than 8 bytes in packets (BAM of J1939-21): an announcement, then 7 bytes per packet.
 //!
-//! The standard requires 50 to 200 ms between packets. The next frame is due 50 ms after the last frame was sent, so
-//! packets keep their spacing after a late poll.
+//! The standard requires 50 to 200 ms between packets. Each frame is due 50 ms after the previous frame, so that a late
+//! poll does not shorten the spacing.
 
 use serde::{Deserialize, Serialize};
 
@@ -13,9 +13,8 @@ use crate::quantity::Timestamp;
 /// Shortest time between two frames of the transport protocol, ns.
 pub(super) const PACKET_SPACING_NS: i64 = 50_000_000;
 
-/// Control byte of a broadcast announcement.
+/// Control byte of the announcement.
 pub(super) const BAM: u8 = 32;
-/// Payload bytes in one packet.
 pub(super) const PACKET_BYTES: usize = 7;
 
 // Sequence numbers are one byte and start at 1.
@@ -23,16 +22,15 @@ const _: () = assert!(MAX_PAYLOAD <= 255 * PACKET_BYTES);
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct Transfer {
-    /// The transferred parameter group.
     pub(super) pgn: u32,
-    /// When the next packet is due.
+    /// Time of the next packet.
     pub(super) due: Timestamp,
     payload: DmPayload,
     sent_packets: u8,
 }
 
 impl Transfer {
-    /// Starts a transfer; returns it with its announcement.
+    /// Returns the transfer with its announcement.
     pub(super) fn start(now: Timestamp, pgn: u32, payload: DmPayload, source: u8) -> (Self, Option<Frame>) {
         let transfer = Self { pgn, due: now.plus_nanos(PACKET_SPACING_NS), payload, sent_packets: 0 };
         let bytes = payload.as_slice().len();
@@ -44,7 +42,6 @@ impl Transfer {
         (transfer, Frame::classic(id, &announcement))
     }
 
-    /// The next packet, if it is due.
     pub(super) fn poll(&mut self, now: Timestamp, source: u8) -> Option<Frame> {
         if now < self.due || self.is_complete() {
             return None;

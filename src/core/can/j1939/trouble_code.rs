@@ -7,26 +7,26 @@
 //! ```
 //! A message without codes has four zero bytes instead of the codes. A message with at most one code is padded with
 //! 0xFF to 8 bytes. SPN is the suspect parameter number, and FMI the failure mode identifier. The highest bit of an
-//! occurrence count is the conversion method. If this bit is set, the SPN has one of three older layouts, which cannot
-//! be distinguished. packwatch never sets this bit.
+//! occurrence count is the conversion method. packwatch never sets it, because a receiver could then not tell three
+//! older layouts of the SPN apart.
 
 use serde::{Deserialize, Serialize};
 
 use super::name::OutOfRange;
 
 /// Maximum number of codes in one message. 27 codes are 110 bytes in 16 packets. The packets are sent every 50 ms, each
-/// up to one tick of 10 ms late. So a transfer ends within 0.96 s, before the next DM1 is due. packwatch's 17 alarm
-/// rules need only 17 codes if the thresholds of each rule share a parameter number, because then only the code of the
-/// most severe threshold is sent.
+/// up to one tick of 10 ms late. A transfer therefore ends within 0.96 s, before the next DM1 is due. packwatch's 18
+/// alarm rules need only 18 codes if the thresholds of each rule share a parameter number, because then only the most
+/// severe threshold is sent.
 pub const MAX_CODES: usize = 27;
 
 pub(super) const MAX_PAYLOAD: usize = 2 + 4 * MAX_CODES;
 
-/// Largest suspect parameter number: 19 bits.
+/// 19 bits.
 const MAX_SPN: u32 = (1 << 19) - 1;
-/// Largest failure mode identifier: 5 bits.
+/// 5 bits.
 const MAX_FMI: u8 = 31;
-/// Largest occurrence count; 127 means "not available", so counting stops at 126.
+/// 127 means "not available", so counting stops at 126.
 const MAX_OCCURRENCES: u8 = 126;
 
 /// A failure and its number of occurrences.
@@ -38,11 +38,8 @@ pub struct TroubleCode {
 }
 
 impl TroubleCode {
-    /// Creates a code: suspect parameter number 1 to 524,287, failure mode identifier 0 to 31. The count saturates at
-    /// 126.
-    ///
-    /// # Errors
-    /// A number does not fit its bits, or the SPN is 0, which would mean "no code".
+    /// Creates a code. The count saturates at 126. Fails if a number does not fit its bits, or if the SPN is 0, which
+    /// would mean "no code".
     pub fn new(spn: u32, fmi: u8, occurrence_count: u32) -> Result<Self, OutOfRange> {
         if !(1..=MAX_SPN).contains(&spn) {
             return Err(OutOfRange { field: "spn", found: spn.into(), lowest: 1, highest: MAX_SPN.into() });
@@ -60,12 +57,12 @@ impl TroubleCode {
         Self { occurrence_count, ..self }
     }
 
-    /// Suspect parameter number: the failed part.
+    /// Suspect parameter number: the failed part, 1 to 524,287.
     pub const fn spn(self) -> u32 {
         self.spn
     }
 
-    /// Failure mode identifier: the kind of failure.
+    /// Failure mode identifier: the kind of failure, 0 to 31.
     pub const fn fmi(self) -> u8 {
         self.fmi
     }
@@ -86,16 +83,16 @@ impl TroubleCode {
     }
 }
 
-/// The lamp of a code, least severe first. The malfunction lamp is not included, because it is only for emissions.
+/// The lamp of a code, least severe first. The malfunction lamp is only for emissions, so it is not included.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Lamp {
     None,
-    /// Protect lamp: a fault outside the electronics.
+    /// A fault outside the electronics.
     Protect,
-    /// Amber warning lamp: service is needed, but the vehicle need not stop.
+    /// Service is needed, but the vehicle need not stop.
     Amber,
-    /// Red stop lamp: the driver must stop the vehicle.
+    /// The driver must stop the vehicle.
     Red,
 }
 
@@ -103,23 +100,17 @@ pub enum Lamp {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 #[repr(u8)]
 pub enum LampState {
-    /// There is no fault.
     #[default]
     Off = 0b00,
-    /// There is a fault.
     On = 0b01,
-    /// It is unknown whether there is a fault.
     NotAvailable = 0b11,
 }
 
 /// The lamps of a message. The malfunction lamp is always off, because packwatch does not monitor emissions.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Lamps {
-    /// Protect lamp.
     pub protect: LampState,
-    /// Amber warning lamp.
     pub amber: LampState,
-    /// Red stop lamp.
     pub red: LampState,
 }
 
@@ -166,7 +157,7 @@ impl From<DmPayload> for Vec<u8> {
     }
 }
 
-/// A stored payload; bytes beyond [`MAX_PAYLOAD`] are dropped.
+/// Bytes beyond [`MAX_PAYLOAD`] are dropped.
 impl From<Vec<u8>> for DmPayload {
     fn from(stored: Vec<u8>) -> Self {
         let mut bytes = [0xFF; MAX_PAYLOAD];
@@ -175,8 +166,7 @@ impl From<Vec<u8>> for DmPayload {
     }
 }
 
-/// Payload with lamps and codes. It contains at most the first [`MAX_CODES`] codes, so the caller must pass the most
-/// severe codes first.
+/// Payload with lamps and at most the first [`MAX_CODES`] codes. The caller must pass the most severe codes first.
 pub fn dm_payload(lamps: Lamps, codes: &[TroubleCode]) -> DmPayload {
     let mut bytes = [0xFF; MAX_PAYLOAD];
     bytes[0] = lamps.to_byte();

@@ -35,7 +35,7 @@ struct Bench {
     is_awake: bool,
     sent: Vec<(i64, Vec<u8>)>,
     changes: Vec<(i64, PollChange)>,
-    /// How the controller responds to a request.
+    /// Response to a request.
     answer: fn(&[u8]) -> Behaviour,
 }
 
@@ -213,7 +213,7 @@ fn standby_stops_polling() {
     assert!(!bench.requests().is_empty());
 }
 
-/// A poller after a restart at `at_ms` from the progress of `bench`, in a moving car with an awake bus.
+/// A poller after a restart at `at_ms`, with the stored progress of `bench`, in a moving car with an awake bus.
 fn restarted(bench: &Bench, at_ms: i64) -> Bench {
     let mut stored = bench.poller.progress().clone();
     let taken = at(bench.now_ms);
@@ -318,9 +318,9 @@ fn car_state_sets_request_period() {
 }
 
 proptest! {
-    /// For any input, the poller keeps four limits. It sends only flow control and requests of reading services. It
-    /// sends nothing within a minute of another tester's request. It does not exceed the allowed rate. Its next due
-    /// time is always in the future, so the driver does not spin.
+    /// The poller sends only flow control and requests of reading services. It pauses for a minute after another
+    /// tester's request and keeps the allowed rate. Its next due time is in the future, so that the driver does not
+    /// spin.
     #[test]
     fn poller_keeps_its_limits_for_any_input(
         acts in proptest::collection::vec((0_u8..8, 0_u16..3000, any::<[u8; 8]>()), 1..80)

@@ -5,7 +5,7 @@ use super::*;
 const BUS: BusIndex = BusIndex(0);
 const ID: CanId = CanId::Standard(0x100);
 
-/// Simulates senders, each with its period (ms), start and end (s), and jitter (fraction of the period).
+/// Simulates senders with period (ms), start and end (s), and jitter (fraction of the period).
 fn run(rates: &mut SecondSenders, senders: &[(f64, f64, f64, f64)]) -> Vec<(f64, bool)> {
     let mut times: Vec<(i64, usize)> = Vec::new();
     let mut noise = 0x2545_F491_u64;
@@ -56,7 +56,7 @@ fn jitter_or_new_cycle_is_not_second_sender() {
     for jitter in [0.0, 0.3] {
         let waking = [(100.0, 0.0, 60.0, jitter), (10.0, 60.0, 120.0, jitter)];
         let mut rates = watched(None);
-        // A single sender changes from the first period to the second, so the currents do not alternate.
+        // A single sender changes its period.
         let mut found = Vec::new();
         for (period_ms, from_s, to_s, jitter) in waking {
             found.extend(run(&mut rates, &[(period_ms, from_s, to_s, jitter)]));

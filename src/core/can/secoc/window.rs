@@ -1,15 +1,14 @@
-//! Decides which freshness values a command may have. The receiver announces the values, accepts no value twice, and
-//! lets a value expire after two announcements.
+//! Decides which freshness values a command may have.
 //!
 //! The receiver announces a value once a second, each time [`ANNOUNCEMENT_STEP`] higher. A command carries the
-//! announced value, or a higher value that is below the next announcement. The sender uses each value once and in
-//! rising order. The receiver accepts a value if it is higher than all values accepted before, not below the previous
-//! announcement, and below the next announcement. If an attacker delays a command, the command expires within two
-//! seconds. A command with an invented value is useless until the receiver announces that value.
+//! announced value, or a higher value below the next announcement. The sender uses each value once and in rising order.
+//! The receiver accepts a value if it is higher than all values accepted before, not below the previous announcement,
+//! and below the next announcement. If an attacker delays a command, the command therefore expires within two seconds.
+//! A command with an invented value is useless until the receiver announces that value.
 //!
 //! The sender stores nothing: after a restart, it waits for an announcement. The receiver stores its state. After a
 //! restart, the receiver begins [`RESTART_STEPS`] announcements above the stored state, or at [`ANNOUNCEMENT_STEP`]
-//! times its clock (Unix time in seconds) if that is higher. Therefore it never reuses a value of the previous run,
+//! times its clock (Unix time in seconds) if that is higher. It therefore never reuses a value of the previous run,
 //! even if that value was not stored.
 
 use serde::{Deserialize, Serialize};
@@ -19,24 +18,22 @@ use crate::quantity::Timestamp;
 
 /// Difference between two announcements, and the number of commands that one announcement allows.
 pub const ANNOUNCEMENT_STEP: u64 = 16;
-/// Number of announcements skipped at a start. At one announcement a second, they cover more than an hour in which the
-/// state could not be stored.
+/// Number of announcements that are skipped at a start. They cover more than an hour in which the state could not be
+/// stored.
 const RESTART_STEPS: u64 = 4096;
-/// A stored value above this limit is damaged, because reaching it takes 10^9 years.
+/// A higher stored value is damaged, because reaching it takes 10^9 years.
 const MAX_FRESHNESS: u64 = 1 << 60;
 
 /// Freshness values that a receiver accepts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FreshnessWindow {
-    /// The last announced value, a multiple of the step.
     pub(super) announced: u64,
-    /// The highest accepted value.
     pub(super) accepted: u64,
 }
 
 impl FreshnessWindow {
-    /// Begins a run at `now`. Skips every value that an earlier run can have announced.
+    /// Begins a run. Skips every value that an earlier run can have announced.
     pub fn begin(&mut self, now: Timestamp) {
         let by_clock = u64::try_from(now.nanos() / 1_000_000_000).unwrap_or(0).saturating_mul(ANNOUNCEMENT_STEP);
         self.advance(RESTART_STEPS);
@@ -49,7 +46,7 @@ impl FreshnessWindow {
         self.announced
     }
 
-    /// Expires every announced value. Called after a time without listening.
+    /// Expires every announced value.
     pub fn expire(&mut self) {
         self.advance(2);
     }
@@ -63,8 +60,8 @@ impl FreshnessWindow {
         self.announced.saturating_sub(ANNOUNCEMENT_STEP).max(self.accepted.saturating_add(1))
     }
 
-    /// The values that a payload's freshness may represent. The result is empty if the freshness is expired or the
-    /// payload is too short.
+    /// The values that a payload's freshness may represent. Empty if the freshness is expired or the payload is too
+    /// short.
     pub fn check(&self, authentication: Authentication, payload: &[u8]) -> MacCheck {
         let mut candidates = [None; MAX_CANDIDATES];
         if let Some(sent) = authentication.sent_freshness(payload) {

@@ -178,7 +178,7 @@ fn nearest_equals_round_for_special_numbers() {
     assert_eq!(nearest(f64::NAN), 0);
 }
 
-/// Reference for [`SignalPlan::code`] of integer signals, calculated in a type that holds every code.
+/// Reference for [`SignalPlan::code`], in a number type that holds every code.
 fn code_by_definition(layout: &SignalLayout, value: f64) -> u64 {
     let (low, high) = layout.code_limits();
     let code = (((value - layout.offset) / layout.factor).round() as i128).clamp(low, high);

@@ -104,7 +104,6 @@ impl Bench {
     }
 }
 
-/// The response message with these codes.
 fn message(identifier: u8, codes: &[u16]) -> Vec<u8> {
     [0x61, identifier].into_iter().chain(codes.iter().flat_map(|code| code.to_be_bytes())).collect()
 }
@@ -185,8 +184,7 @@ fn flood_of_foreign_first_frames_uses_no_memory() {
         bench.hear(CanId::Standard(id), &[0x1F, 0xFF, 1, 2, 3, 4, 5, 6]);
     }
     assert_eq!(bench.listener.counts().count(), 1);
-    // The listener handles only the identifiers of responses and requests. The frame with the identifier of the
-    // responses started a message, which is not counted yet.
+    // The frame with the response identifier started a message, which is not counted yet.
     assert_eq!(bench.counts(), ControllerCounts::default());
 }
 

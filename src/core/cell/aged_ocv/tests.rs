@@ -1,4 +1,4 @@
-//! Tests that the offsets of aged curves agree with the electrodes, continue at the edges, and keep the curves rising.
+//! Tests that the offsets of aged curves agree with the electrodes, are continuous, and keep the curves rising.
 
 use super::*;
 use crate::cell::electrodes::tests::{LFP, M50};
@@ -45,15 +45,13 @@ fn offsets_match_aged_curves_and_are_continuous() {
         let (least, edge) = (offset_v(&table, s, 0.5), offset_v(&table, s, 2.0));
         assert!((least - edge).abs() < 1e-9, "constant below the lowest capacity: {least} {edge}");
     }
-    // One standard deviation of the mix changes the offset by half of the difference between two offsets: with a share
-    // of 0.6 of lost negative material, and with a share of 0.
+    // The mix is half of the difference between two offsets: with the shares 0.6 and 0 of lost negative material.
     let with =
         |negative: f64| M50.aged(LostMaterial { negative: negative * 0.2, positive: 0.3 * 0.2 }, 0.8).expect("a cell");
     let expected_v = 0.5 * (with(0.6).voltage_v(SOC[2]) - with(0.0).voltage_v(SOC[2]));
     let mix_v = |capacity_ah: f64| table.line(&SOC, 2, capacity_ah).mixes_v[0].at(SOC[2]);
     assert!((mix_v(4.0) - expected_v).abs() < 1e-9, "{} {expected_v}", mix_v(4.0));
     assert!(mix_v(4.0).abs() > 0.001 && mix_v(4.5).abs() < mix_v(4.0).abs());
-    // The change with the capacity is the difference of the offsets divided by the difference of the capacities.
     let per_ah_v = (offset_v(&table, 2, 4.2) - offset_v(&table, 2, 4.1)) / 0.1;
     assert!((table.line(&SOC, 2, 4.15).per_ah_v.at(SOC[2]) - per_ah_v).abs() < 1e-9);
 }
@@ -65,7 +63,7 @@ fn shift_keeps_both_ends() {
     assert!((offset_v(&table, 2, 1.5) - 0.2 * 0.4 * 0.6).abs() < 1e-12);
     assert_eq!(offset_v(&table, 0, 1.5), 0.0);
     assert!(table.line(&SOC, 4, 1.5).offset_v.at(1.0).abs() < 1e-12);
-    // The shift's standard deviation of 0.3 moves the curve by 0.3 x 0.25 s (1 - s). Only a shift has this deviation.
+    // The shift's standard deviation of 0.3 moves the curve by 0.3 x 0.25 s (1 - s).
     let mix_v = |table: &AgedOcv| table.line(&SOC, 2, 1.5).mixes_v[0].at(SOC[2]);
     assert!((mix_v(&table) - 0.075 * 0.4 * 0.6).abs() < 1e-12);
     let (mut other, mut electrodes) = (table.clone(), m50());

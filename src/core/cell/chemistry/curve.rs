@@ -1,10 +1,11 @@
 //! Computes the mean and the spread of open-circuit curves from half-cell potentials, for the cells of one chemistry.
 //!
-//! In: positive and negative materials, cut-off voltages (V). Out: mean (V) and covariance (V^2) over SOC breakpoints.
+//! In: positive and negative materials, and cut-off voltages (V). Out: mean (V) and covariance (V^2) at SOC
+//! breakpoints.
 //!
-//! A cell is described by a pair of materials and two lithium contents: the negative electrode's content in the full
-//! cell, and the positive electrode's content in the empty cell. The other two contents follow from the cut-off
-//! voltages. All pairs and all contents of a grid are equally likely. Two further errors cover cells that no pair
+//! A cell has a pair of materials and two free lithium contents: the content of the negative electrode in the full
+//! cell, and the content of the positive electrode in the empty cell. The cut-off voltages determine the other two
+//! contents. All pairs and all contents of a grid are equally likely. Two further errors cover cells that no pair
 //! describes: a smooth deviation of 10 mV (30 mV below 5 % SOC), and half of the hysteresis.
 
 use nalgebra::{DMatrix, SymmetricEigen};
@@ -13,9 +14,8 @@ use crate::cell::aged_ocv::MIXES;
 use crate::cell::electrodes::{Electrodes, NegativeMaterial, PositiveMaterial};
 use crate::filter::{bell, crossing};
 
-/// Number of intervals in the table of a blend.
 const BLEND_POINTS: u32 = 400;
-/// Lowest and highest voltage in the table of a blend (V).
+/// Range of the potentials in the table of a blend (V).
 const BLEND_V: (f64, f64) = (2.5, 4.8);
 
 /// A positive electrode made of one material or of two.
@@ -23,7 +23,7 @@ const BLEND_V: (f64, f64) = (2.5, 4.8);
 pub enum PositiveElectrode {
     /// One material.
     One(PositiveMaterial),
-    /// A blend: lithium content at equally spaced potentials, from the lowest potential to the highest.
+    /// A blend: lithium contents at equally spaced, rising potentials.
     Blend(Vec<f64>),
 }
 
@@ -34,8 +34,8 @@ impl From<PositiveMaterial> for PositiveElectrode {
 }
 
 impl PositiveElectrode {
-    /// Two materials in one electrode. Both have the same potential, so their contents are added. `share` is the
-    /// fraction of the electrode's capacity that material `a` holds.
+    /// Two materials in one electrode. Both have the same potential, so their contents are added. Material `a` holds
+    /// the fraction `share` of the electrode's capacity.
     pub fn blend(a: PositiveMaterial, share: f64, b: PositiveMaterial) -> Self {
         let content = |material: PositiveMaterial, potential_v: f64| {
             let ends = (material.least_content(), 1.0);
@@ -95,22 +95,21 @@ pub struct CurvePrior {
     pub electrodes: Option<Electrodes>,
 }
 
-/// Lithium contents and curve (V) of one cell. The contents are [negative electrode in the empty cell, negative in the
-/// full cell, positive in the empty cell, positive in the full cell].
+/// One cell. The contents are [negative empty, negative full, positive empty, positive full]; the curve is in V.
 struct PossibleCell {
     contents: [f64; 4],
     curve_v: Vec<f64>,
 }
 
 impl CurvePrior {
-    /// Curves of all pairs of materials; `None` if no pair gives a cell between the voltages.
+    /// Computes curves of all pairs of materials. Returns `None` if no pair gives a cell between the voltages.
     pub fn new(cell_type: &CellType<'_>, soc: &[f64]) -> Option<Self> {
         let CellType { positives, negatives, empty_v, full_v, hysteresis_v } = *cell_type;
         let pairs = positives.iter().flat_map(|p| negatives.iter().map(move |&n| (p, n)));
         let with_contents = |(p, n)| {
-            // The first list is the content of the negative electrode in the full cell. It is low in fast-charging
-            // designs and high in high-energy designs. The second list is the content of the positive electrode in the
-            // empty cell. It is below 1, because lithium is lost in the first cycles.
+            // First list: content of the negative electrode in the full cell, from fast-charging to high-energy
+            // designs. Second list: content of the positive electrode in the empty cell. It is below 1, because lithium
+            // is lost in the first cycles.
             let contents =
                 [0.78, 0.84, 0.90, 0.95].iter().flat_map(|&x| [0.84, 0.88, 0.92, 0.97].iter().map(move |&y| (x, y)));
             let ends = contents.flat_map(|contents| full_v.iter().map(move |&full_v| (contents, full_v)));
@@ -126,13 +125,11 @@ impl CurvePrior {
         let mean_v: Vec<f64> =
             (0..soc.len()).map(|s| cells.iter().map(|(_, cell)| cell.curve_v[s]).sum::<f64>() / count).collect();
         let off_v = |cell: &PossibleCell, s: usize| cell.curve_v[s] - mean_v[s];
-        // Smooth deviation (V) of a cell's materials from the materials of the same name in `cell::electrodes`. It is
-        // larger where the curves are steep. The fit of electrodes (`ident::electrodes` in packwatch-lab) allows the
-        // same deviations.
+        // Smooth deviation (V) of a cell's materials from the materials in `cell::electrodes`, larger where the curves
+        // are steep. The fit of electrodes (`ident::electrodes` in packwatch-lab) allows the same deviations.
         let material_v = |s: usize| if soc[s] < 0.05 { 0.030 } else { 0.010 };
         let covariance = DMatrix::from_fn(soc.len(), soc.len(), |a, b| {
             let between: f64 = cells.iter().map(|(_, cell)| off_v(cell, a) * off_v(cell, b)).sum::<f64>() / count;
-            // The deviation changes over 15 % of SOC.
             let material = material_v(a) * material_v(b) * bell((soc[a] - soc[b]) / 0.15);
             between + material + hysteresis_v * hysteresis_v
         });
@@ -150,8 +147,8 @@ impl CurvePrior {
         Some(Self { soc: soc.to_vec(), mean_v, covariance, electrodes })
     }
 
-    /// The largest independent modes of the spread (V) per standard deviation, and the standard deviation of the rest,
-    /// V. Modes are ordered by their effect on the SOC that a voltage reading gives.
+    /// Independent modes of the differences between cells (V per standard deviation), and the standard deviation of the
+    /// remaining differences (V). The first modes have the largest effect on the SOC that a voltage reading gives.
     pub fn modes_v(&self) -> ([Vec<f64>; MIXES], Vec<f64>) {
         let n = self.soc.len();
         let slope_v = |s: usize| {
@@ -167,7 +164,7 @@ impl CurvePrior {
         order.sort_by(|&a, &b| eigen.eigenvalues[b].total_cmp(&eigen.eigenvalues[a]));
         let mode = |k: usize| {
             let (column, scale) = (eigen.eigenvectors.column(order[k]), eigen.eigenvalues[order[k]].max(0.0).sqrt());
-            // The sign of an eigenvector is arbitrary: make its largest component positive.
+            // Make the largest component positive, because the sign of an eigenvector is arbitrary.
             let largest = column.iter().copied().fold(0.0, |m: f64, v| if v.abs() > m.abs() { v } else { m });
             (0..n).map(|s| largest.signum() * scale * column[s] / weight[s]).collect::<Vec<f64>>()
         };
@@ -182,14 +179,13 @@ impl CurvePrior {
     }
 }
 
-/// Inverse of a curve's covariance, to which a roughness of 2 mV is added; `None` if the sum is not positive definite.
+/// Inverse of a curve's covariance plus a roughness of 2 mV; `None` if this sum is not positive definite.
 pub fn information(covariance_v2: &DMatrix<f64>) -> Option<DMatrix<f64>> {
     let own = DMatrix::from_diagonal_element(covariance_v2.nrows(), covariance_v2.nrows(), 0.002 * 0.002);
     Some((covariance_v2 + own).cholesky()?.inverse())
 }
 
-/// The cell made of a pair of materials, with these lithium contents (of the negative electrode in the full cell, of
-/// the positive electrode in the empty cell) and these cut-off voltages; `None` if such a cell does not exist.
+/// The cell with these materials, lithium contents and cut-off voltages; `None` if such a cell does not exist.
 fn possible_cell(
     (positive, negative): (&PositiveElectrode, NegativeMaterial),
     (negative_full, positive_empty): (f64, f64),

@@ -1,4 +1,4 @@
-//! Tests of models from labels: every chemistry has a model, and its curve is plausible for cells of this chemistry.
+//! Tests that every chemistry has a model with a plausible curve.
 
 use super::*;
 use crate::cell::TemperaturePosition;

@@ -1,4 +1,4 @@
-//! Tests the half-cell potentials, and cells whose ageing is computed from their electrodes.
+//! Tests the half-cell potentials and the ageing that is computed from electrodes.
 
 use super::*;
 
@@ -57,7 +57,7 @@ fn lithium_loss_slides_electrodes() {
     for end in [0.0, 1.0] {
         assert!((aged.voltage_v(end) - M50.voltage_v(end)).abs() < 1e-6);
     }
-    // The graphite's last stage comes at a lower SOC, and the positive electrode contains less lithium at every SOC.
+    // The last stage of graphite moves to a lower SOC, and the positive electrode contains less lithium at every SOC.
     assert!(aged.voltage_v(0.5) - M50.voltage_v(0.5) > 0.03, "{}", aged.voltage_v(0.5) - M50.voltage_v(0.5));
     assert!((0..100).all(|k| aged.voltage_v(0.01 * f64::from(k + 1)) > aged.voltage_v(0.01 * f64::from(k))));
 }

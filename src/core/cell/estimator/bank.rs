@@ -1,16 +1,17 @@
-//! The estimators of all cells of one type. They are stepped together.
+//! Steps the estimators of all cells of one type together.
 //!
 //! In: one [`CellStep`] per cell and batch (V, A, s, degrees C). Out: a [`StepResult`] and estimates per cell.
 //!
 //! Almost every step is ordinary: the current was measured for the whole time since the last voltage, and the voltage
-//! is within the gate. The [`kernel`] computes ordinary steps for [`WIDTH`] cells at a time, on structures of arrays
-//! with one cell per lane. With the feature `wide`, the bank selects the machine's widest vector instructions at run
-//! time. Without the feature or without such instructions, the bank steps the cells one by one. All other steps (for
-//! example a first voltage, a gap, an unknown current, a reading beyond the gate, a covariance without a Cholesky
-//! factor) use parts of the same kernel with one lane ([`SingleCell`]). The tests compare the kernel with the textbook
-//! filter: the SOC agrees within 1e-9 over 100,000 steps. Whether a step is ordinary depends only on the cell itself,
-//! and the bits of a lane do not depend on other lanes. Therefore, a cell's estimates do not depend on the other cells
-//! of the pack.
+//! is within the gate. The [`kernel`] computes ordinary steps for [`WIDTH`] cells at a time, with one cell per vector
+//! lane. With the feature `wide`, the bank uses the machine's widest vector instructions. Without such instructions, it
+//! steps the cells one by one. All other steps use parts of the same kernel with one lane ([`SingleCell`]). Examples
+//! are a first voltage, a gap, an unknown current, and a reading beyond the gate.
+//!
+//! A cell's estimates do not depend on the other cells of the pack. Whether a step is ordinary depends only on the cell
+//! itself, and the bits of a lane do not depend on other lanes.
+//!
+//! The tests compare the kernel with the textbook filter: the SOC agrees within 1e-9 over 100,000 steps.
 
 mod filter_array;
 mod input;
@@ -40,14 +41,12 @@ pub struct EstimatorBank {
     config: EstimatorConfig,
     constants: KernelConstants,
     voltage_reach: VoltageReach,
-    /// Smallest and largest plausible capacity (Ah).
     plausible_ah: (f64, f64),
     filters: FilterArrays,
     cells: Vec<CellSlot>,
-    /// The inputs of the batch. If a cell is not in the batch, its input is old, and the result is discarded.
+    /// If a cell is not in the batch, its input is old, and the result is discarded.
     inputs: Vec<BlockInput>,
     results: Vec<StepResult>,
-    /// The steps of the batch that are not ordinary, each with the index of its cell.
     others: Vec<(usize, CellStep)>,
     #[cfg(feature = "wide")]
     machine: pulp::Arch,
@@ -165,7 +164,6 @@ impl EstimatorBank {
         &self.results[cell]
     }
 
-    /// Predicted temperature of a cell without a sensor value (degrees C).
     fn modelled_c(&self, cell: usize, step: &CellStep) -> f64 {
         let soc = self.soc(cell).map_or(0.5, |soc| soc.mean);
         thermal_c(&self.model, self.cells[cell].memory.temperature_c, soc, self.log_resistance(cell).mean, step)
@@ -177,7 +175,7 @@ impl EstimatorBank {
         self.cells[cell].has_filter
     }
 
-    /// State of charge in the filter, without the uncertainty of downtime and without limits.
+    /// State of charge in the filter, without limits and without the uncertainty of downtime.
     pub fn filtered_soc(&self, cell: usize) -> Option<ScalarGaussian> {
         self.is_started(cell).then(|| self.marginal(cell, 0))
     }
@@ -205,7 +203,7 @@ impl EstimatorBank {
         Some((self.soc(lowest)?, self.soc(highest)?))
     }
 
-    /// ln of the resistance relative to new.
+    /// ln of the resistance relative to a new cell.
     #[inline]
     pub fn log_resistance(&self, cell: usize) -> ScalarGaussian {
         let CellSlot { memory, has_filter, .. } = &self.cells[cell];
@@ -293,10 +291,9 @@ impl EstimatorBank {
         result
     }
 
-    /// Evidence about the current sensor's offset since the last correction. For an innovation e, let d be the effect
-    /// of one standard deviation of the offset on e, and R the variance of e without this effect. The first value is
-    /// the sum of d^2 / R, the second value the sum of d e / R. The sums are averaged over the cells, because the
-    /// models of the cells have common errors.
+    /// Evidence about the current sensor's offset since the last correction: the sums of d^2 / R and of d e / R. e is
+    /// an innovation, d is the effect of one standard deviation of the offset on e, and R is the variance of e without
+    /// this effect. The sums are averaged over the cells, because the models of the cells have common errors.
     pub fn offset_evidence(&self) -> (f64, f64) {
         let cells = self.cells.len();
         let mean = |i: usize| {
@@ -333,7 +330,7 @@ impl EstimatorBank {
         (0..self.cells.len()).for_each(|cell| self.change(cell, &mut change));
     }
 
-    /// Change of a cell's SOC per standard deviation of the voltage's constant error, fraction.
+    /// Change of a cell's SOC (fraction) per standard deviation of the voltage's constant error.
     #[inline]
     fn soc_by_voltage(&self, cell: usize) -> f64 {
         let (block, lane) = (cell / WIDTH, cell % WIDTH);
@@ -352,7 +349,6 @@ impl EstimatorBank {
     }
 }
 
-/// Minimum and maximum plausible capacity (Ah), from the model's capacity and the configured capacity.
 fn plausible_ah(model: &CellModel, config: &EstimatorConfig) -> (f64, f64) {
     let (model_ah, initial_ah) = (model.capacity_ah, config.initial.capacity_ah);
     (bounds::TRUSTED_CAPACITY.low * model_ah.min(initial_ah), bounds::TRUSTED_CAPACITY.high * model_ah.max(initial_ah))

@@ -1,8 +1,9 @@
-//! The estimator of a single cell outside its bank: steps that are not ordinary ([`super::bank`]), restarts, learning
-//! and estimates.
+//! The estimator of one cell outside its bank: steps that are not ordinary ([`super::bank`]), restarts, learning and
+//! estimates.
 //!
 //! In: one [`CellStep`] per voltage reading. Out: a [`StepResult`], and estimates with their variances. A reading
-//! beyond the gate does not correct the state; a step that cannot be computed restarts the filter.
+//! beyond the gate does not correct the state. If a step cannot be computed, the filter restarts. Constant errors are
+//! errors that do not change with time, such as the offset of a sensor.
 
 use nalgebra::SMatrix;
 
@@ -21,15 +22,15 @@ use crate::cell::{CellModel, EstimatorConfig, MAX_BRANCHES, SensorErrors};
 use crate::filter::ScalarGaussian;
 use crate::quantity::bounds;
 
-/// A change of the SOC over a gap that the counted charge does not explain is a jump if it exceeds both limits: this
-/// fraction, and this many standard deviations of the SOC before the step.
+/// A change of the SOC over a gap is called a jump if the counted charge does not explain it. The unexplained part must
+/// exceed this fraction and [`JUMP_SIGMA`] standard deviations of the SOC before the step.
 const JUMP: f64 = 0.05;
 const JUMP_SIGMA: f64 = 4.0;
 
 /// State from which a cell continues with another model.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AdoptedState {
-    /// SOC, fraction; `None` = start from the next voltage.
+    /// SOC (fraction); `None` = start from the next voltage.
     pub soc: Option<ScalarGaussian>,
     /// Covariance of SOC and capacity (Ah).
     pub soc_by_capacity: f64,
@@ -37,8 +38,8 @@ pub struct AdoptedState {
     pub capacity: ScalarGaussian,
     /// ln of the resistance relative to the model.
     pub log_resistance: f64,
-    /// Current after first-order filters with the time constants of the branches (A); `None` = the branches have
-    /// relaxed.
+    /// Current (A) after first-order low-pass filters with the time constants of the branches; `None` = the branches
+    /// have relaxed.
     pub filtered_a: Option<[f64; MAX_BRANCHES]>,
 }
 
@@ -55,7 +56,7 @@ impl CellEstimator {
         Self { filter: None, memory: Memory::new(config) }
     }
 
-    /// Computes a step that is not ordinary: predicts over the time since the last reading, then updates with the
+    /// Computes a step that is not ordinary: a prediction over the time since the last reading, then an update with the
     /// voltage.
     pub(super) fn rare_step(
         &mut self,
@@ -75,8 +76,8 @@ impl CellEstimator {
             self.start(model, config, &step);
         }
         if let (None, Some(x)) = (&result, &mut self.filter) {
-            // The step failed, possibly because the correlation made the covariance indefinite. Remove the correlation
-            // and the effects of the constant errors.
+            // If a step fails, the correlation or the constant errors may have made the covariance indefinite. Remove
+            // them.
             x.correlate(LOG_RESISTANCE, CAPACITY, 0.0);
             x.by_constant.fill(0.0);
         }
@@ -87,7 +88,6 @@ impl CellEstimator {
         StepResult { update: result.flatten(), reset, jumped }
     }
 
-    /// Computes the step; `None` if this is not possible.
     fn try_step(
         &mut self,
         kernel: &mut SingleCell,
@@ -135,8 +135,8 @@ impl CellEstimator {
         Some(Some(update))
     }
 
-    /// Starts SOC and branches. If the configuration states a SOC, the first start uses this SOC. Otherwise, the SOC
-    /// comes from the voltage. Keeps the learned resistance and capacity.
+    /// Starts SOC and branches, and keeps the learned resistance and capacity. The SOC comes from the voltage. At the
+    /// first start, a configured SOC has priority.
     fn start(&mut self, model: &CellModel, config: &EstimatorConfig, step: &CellStep) {
         let first = self.filter.is_none();
         (self.memory.capacity, self.memory.log_resistance) = (self.capacity(), self.log_resistance());
@@ -148,7 +148,7 @@ impl CellEstimator {
             let load_v =
                 model.r0_ohm(&guess) * libm::exp(self.memory.log_resistance.mean) * step.current_a.unwrap_or(0.0);
             let temperature = model.temperature_position(temperature_c);
-            // Limits the SOC, because near the end of a flat curve a small voltage error would give any SOC.
+            // Near the end of a flat curve, a small voltage error would give any SOC, so the SOC is limited.
             model.soc_of_aged_ocv(&temperature, self.memory.curve.mean, step.voltage_v + load_v).clamp(-0.05, 1.05)
         });
         let soc = ScalarGaussian { mean: soc, variance: square(config.initial.soc_std).max(KNOWN_VARIANCE) };
@@ -160,8 +160,8 @@ impl CellEstimator {
             by_constant: self.learned_by_constant(),
         };
         self.filter = Some(Gaussian::at_start(soc, &branch_variance[..model.branches.len()], &kept));
-        // A restart alone does not make the estimate trusted again: readings that fit must follow for about one window
-        // of the consistency monitor.
+        // A restart alone does not make the estimate trusted again. The consistency monitor first needs about one
+        // window of readings that fit.
         self.memory.mean_nis = self.memory.mean_nis.min(config.consistency.limit * std::f64::consts::E);
         self.memory.information_s = config.voltage.max_information_s;
         (self.memory.downtime_std, self.memory.used_prior, self.memory.noted_s) = (0.0, 0.0, 0.0);
@@ -171,8 +171,8 @@ impl CellEstimator {
         self.memory.is_soc_unknown = false;
     }
 
-    /// Continues with another `model`, from a state that was determined with this model. Discards the estimates of the
-    /// old model.
+    /// Continues with another `model` from `state`, which was determined with this model. The estimates of the old
+    /// model are discarded.
     pub fn adopt(&mut self, model: &CellModel, config: &EstimatorConfig, state: &AdoptedState) {
         let temperature_c = self.memory.temperature_c;
         self.memory.capacity = state.capacity;
@@ -191,7 +191,7 @@ impl CellEstimator {
             covariance: 0.0,
             by_constant: SMatrix::zeros(),
         };
-        // Without any known temperature, assume 25 degrees C.
+        // If no temperature is known, assume 25 degrees C.
         let position = model.grid_position(soc.mean, temperature_c.unwrap_or(25.0));
         let ratio = libm::exp(state.log_resistance);
         let filtered_a = state.filtered_a.unwrap_or_default();
@@ -202,14 +202,14 @@ impl CellEstimator {
             *variance += square(config.initial.log_resistance_std * branch_v(i));
         }
         let mut x = Gaussian::at_start(soc, &branch_variance[..model.branches.len()], &kept);
-        // Limits the correlation to 0.99, because rounding must not make it larger than 1.
+        // Rounding must not make the correlation larger than 1, so it is limited to 0.99.
         let most = 0.99 * (x.covariance[(0, 0)] * x.covariance[(CAPACITY, CAPACITY)]).sqrt();
         x.correlate(0, CAPACITY, state.soc_by_capacity.clamp(-most, most));
         (0..model.branches.len()).for_each(|i| x.mean[BRANCHES + i] = branch_v(i));
         self.filter = Some(x);
     }
 
-    /// Variance of each branch's voltage at a start (V^2). If the start is under load, a usual load of unknown duration
+    /// Variance of each branch's voltage at a start (V^2). If the cell is under load, a usual load of unknown duration
     /// may have charged the branches.
     fn first_branch_variance(
         &self,
@@ -221,7 +221,7 @@ impl CellEstimator {
         let position = model.grid_position(soc, self.memory.temperature_c.unwrap_or(step.ambient_c));
         let ratio = libm::exp(self.memory.log_resistance.mean);
         let is_loaded = step.current_a.is_some_and(|current_a| current_a.abs() > config.gap.rest_current_a);
-        // Usual load before a start under load: C/2.
+        // C/2 counts as the usual load.
         let load_a = if is_loaded { 0.5 * model.rated_capacity_ah } else { 0.0 };
         let mut variance = [square(config.initial.branch_std_v).max(KNOWN_VARIANCE); MAX_BRANCHES];
         for (i, variance) in variance.iter_mut().enumerate().take(model.branches.len()) {
@@ -231,8 +231,6 @@ impl CellEstimator {
         variance
     }
 
-    /// Temperature of the cell (degrees C). If the sensor has no value, the thermal model predicts the temperature from
-    /// the last known temperature.
     fn temperature(&self, model: &CellModel, step: &CellStep) -> f64 {
         step.temperature_c.unwrap_or_else(|| {
             let soc = self.soc().map_or(0.5, |soc| soc.mean);
@@ -265,7 +263,7 @@ impl CellEstimator {
         branch_v
     }
 
-    /// ln of the resistance relative to new.
+    /// ln of the resistance relative to a new cell.
     pub fn log_resistance(&self) -> ScalarGaussian {
         self.marginal(LOG_RESISTANCE).unwrap_or(self.memory.log_resistance)
     }
@@ -279,7 +277,6 @@ impl CellEstimator {
         self.filter.as_ref().map(|x| x.marginal(state))
     }
 
-    /// Errors of ln rho and of the capacity caused by the constant errors.
     fn learned_by_constant(&self) -> SMatrix<f64, 2, CONSTANT_ERRORS> {
         let rows = |x: &Gaussian| x.by_constant.fixed_rows::<2>(LOG_RESISTANCE).into_owned();
         self.filter.as_ref().map_or_else(SMatrix::zeros, rows)
@@ -309,14 +306,13 @@ impl CellEstimator {
         ScalarGaussian::from_std(slow_branch.ratio, slow_branch.std(config.sensor.slow_branch))
     }
 
-    /// Corrects the state by `deviations` standard deviations of a constant error; see [`Gaussian::absorb`].
     fn absorb(&mut self, constant_error: usize, deviations: f64, remains: f64) {
         if let Some(x) = &mut self.filter {
             x.absorb(constant_error, deviations, remains);
         }
     }
 
-    /// Rescales the effects of the constant errors to other standard deviations of these errors.
+    /// Rescales the effects of the constant errors to new standard deviations of these errors.
     pub(super) fn restate_constant_errors(&mut self, old: &SensorErrors, new: &SensorErrors) {
         let Some(x) = &mut self.filter else { return };
         let deviations =
@@ -345,9 +341,9 @@ impl CellEstimator {
         self.filter.as_ref().map_or(0.0, |x| by_curve(x.by_constant[(CAPACITY, CURVE_CAPACITY)]))
     }
 
-    /// Replaces the capacity estimate and the capacity of the open-circuit curve by `capacity`. Called at the end of a
-    /// half-cycle and when the learned capacity is replaced or doubted. The state is corrected as if the new curve had
-    /// been used since the last call.
+    /// Replaces the capacity estimate and the capacity of the open-circuit curve by `capacity`. The caller does this at
+    /// the end of a charge or discharge, and when the learned capacity is replaced or doubted. The state is corrected
+    /// as if the new curve had been used since the last call.
     ///
     /// The variance of the filter does not fall, because the evidence since the last call may have had too much weight.
     pub fn restate_capacity(&mut self, capacity: ScalarGaussian) {
@@ -359,7 +355,7 @@ impl CellEstimator {
         if before.variance > 0.0 {
             x.mean += column * ((before.mean - capacity.mean) / before.std());
         }
-        // The remaining error of the curve is now an error of the capacity.
+        // The remaining error of the curve becomes an error of the capacity.
         x.covariance += column * column.transpose();
         x.by_constant.column_mut(CURVE_CAPACITY).fill(0.0);
         x.mean[CAPACITY] = capacity.mean;
@@ -368,12 +364,12 @@ impl CellEstimator {
         x.covariance[(CAPACITY, CAPACITY)] += missing.max(0.0);
     }
 
-    /// Sets ln of the resistance relative to new, for the next start of the filter.
+    /// Sets ln of the resistance relative to a new cell, for the next start of the filter.
     pub fn relearn_resistance(&mut self, log_resistance: ScalarGaussian) {
         self.memory.log_resistance = log_resistance;
     }
 
-    /// Sets the filter's capacity (Ah) ([`CapacityState::Held`]).
+    /// Sets the filter's capacity (Ah), for [`CapacityState::Held`](crate::cell::CapacityState::Held).
     pub fn hold_capacity(&mut self, capacity_ah: f64) {
         self.memory.capacity.mean = capacity_ah;
         self.memory.curve = ScalarGaussian { mean: capacity_ah, variance: 0.0 };
@@ -382,13 +378,13 @@ impl CellEstimator {
         }
     }
 
-    /// Handles a sleep: the SOC counts as carried over until a voltage has been used.
+    /// Handles a sleep: until a voltage has been used, the SOC counts as carried over.
     pub fn note_sleep(&mut self) {
         self.memory.is_unseen = self.filter.is_some();
     }
 
-    /// Adds a downtime of `downtime_s`: raises the uncertainty of the SOC by the charge that may have been moved in
-    /// either direction.
+    /// Adds a downtime of `downtime_s`. The uncertainty of the SOC grows by the charge that may have moved in either
+    /// direction.
     pub fn note_downtime(&mut self, config: &EstimatorConfig, downtime_s: f64) {
         let downtime_s = downtime_s.max(0.0);
         self.memory.note_downtime(config.gap.away_use_per_s * downtime_s, USED_PRIOR);
@@ -396,8 +392,7 @@ impl CellEstimator {
     }
 }
 
-/// Predicts the temperature (degrees C) of a cell whose sensor has no value. The prediction starts from the last known
-/// temperature.
+/// Predicts the temperature (degrees C) of a cell without a sensor value, starting from the last known temperature.
 pub(super) fn thermal_c(model: &CellModel, last_c: Option<f64>, soc: f64, log_resistance: f64, step: &CellStep) -> f64 {
     let (Some(last_c), Some(thermal)) = (last_c, &model.thermal) else { return last_c.unwrap_or(step.ambient_c) };
     let mean_current_a = if step.measured_s > 0.0 { step.charge_as / step.measured_s } else { 0.0 };
@@ -405,6 +400,6 @@ pub(super) fn thermal_c(model: &CellModel, last_c: Option<f64>, soc: f64, log_re
     let loaded_c =
         circuit::temperature_after(thermal, last_c, step.ambient_c, square(mean_current_a) * ohm, step.measured_s);
     let predicted_c = circuit::temperature_after(thermal, loaded_c, step.ambient_c, 0.0, step.unmeasured_s);
-    // An impossible current gives an impossible temperature.
+    // An impossible current would give an impossible temperature.
     predicted_c.clamp(bounds::TEMPERATURE_C.low, bounds::TEMPERATURE_C.high)
 }

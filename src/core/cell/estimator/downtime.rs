@@ -1,24 +1,27 @@
 //! Handles the possible use of a cell while nothing is measured: the program is stopped, the bus sleeps, or the log has
 //! a gap.
 //!
-//! In: the possible change of the SOC in the downtime, fraction, and the first voltage after the downtime (V). Out: the
-//! updated filter; `None` if the update cannot be computed.
+//! In: the possible change of the SOC in the downtime (fraction), and the first voltage after the downtime (V). Out:
+//! the updated filter; `None` if the update cannot be computed.
 //!
-//! Deviation 6: two hypotheses describe a downtime. First hypothesis, usually the more likely one: the cell rested. The
-//! SOC has only fallen by the self-discharge, and all correlations still hold. Second hypothesis: the cell was used or
-//! charged. The SOC can be anywhere in the range that use or charging can reach in that time, and the branches are as
-//! uncertain as at a start. The first voltage with a known current updates both hypotheses. They are weighted by their
-//! likelihoods (Bayes' rule, prior in [`Memory`]) and merged into one Gaussian with their common mean and covariance.
-//! Effect: after a night without use, the counted charge stays accurate, and the voltage at rest keeps its information
-//! about the capacity. Use that was not measured is found at the first reading; a single narrow Gaussian would need
-//! hours for this. A single wide Gaussian would lose the counted charge.
+//! Deviation 6 (see [`super`]): a downtime is described by two hypotheses.
+//! * The cell rested. This is usually more likely. The SOC has only fallen by the self-discharge, and all correlations
+//!   still hold.
+//! * The cell was used or charged. The SOC can be anywhere within reach in that time, and the branches are as uncertain
+//!   as at a start.
 //!
-//! Until the first voltage arrives, the standard deviation of the second hypothesis is published.
+//! The first voltage with a known current updates both hypotheses. They are weighted by their likelihoods (Bayes' rule,
+//! prior in [`Memory`]) and merged into one Gaussian with their common mean and covariance. Until then, the standard
+//! deviation of the second hypothesis is published.
 //!
-//! A gap (sleep, a hole in a log) is described by the same hypotheses. A load before or after the gap may have
-//! continued or ended during the gap, with equal probability. If the cell rested before and after the gap, only a
-//! charger may have been connected. This is rare, because a bus in use wakes its listeners; it is more likely in a
-//! longer gap. Without the second hypothesis, charge that was not recorded would be learned as a change of capacity.
+//! Effect: after a night without use, the counted charge stays accurate, and the rest voltage keeps its information
+//! about the capacity. Use that was not measured is found at the first reading. A single narrow Gaussian would need
+//! hours for this, and a single wide Gaussian would lose the counted charge.
+//!
+//! A gap (sleep, a hole in a log) is described in the same way. A load before or after the gap continued or ended
+//! during the gap, with equal probability. If the cell rested before and after the gap, a charger may have been
+//! connected. This is rare, because a bus in use wakes its listeners. It is more likely in a longer gap. Without the
+//! second hypothesis, charge that was not recorded would be learned as a change of capacity.
 //!
 //! [`Memory`]: super::memory::Memory
 
@@ -30,8 +33,8 @@ use super::step::{CellStep, Update};
 use super::voltage_reach::{FAR, FLAT};
 use crate::cell::{CellModel, EstimatorConfig};
 
-/// Updates with the first reading after a downtime. This reading does not count as evidence about the sensor's offset
-/// or the slowest branch.
+/// Updates with the first reading after a downtime. This reading is not evidence about the sensor's offset or the
+/// slowest branch.
 pub(super) fn update_after_downtime(
     kernel: &mut SingleCell,
     (x, memory): (&mut Gaussian, &Memory),
@@ -53,17 +56,16 @@ pub(super) fn update_after_downtime(
         branch_variance += used.covariance[(i, i)];
         drop_v += if i + 1 < used.states { used.mean[i] } else { memory.slow_branch.ratio * used.mean[i] };
     }
-    // This wide prior is used only for the weights of the hypotheses; its updated copy is discarded.
+    // Only the weights of the hypotheses use this wide prior; its updated copy is discarded.
     let wide = update(&mut used.clone())?;
     let reach = 3.0_f64.sqrt() * memory.downtime_std;
     let soc = model.soc_of_aged_ocv(&temperature, memory.curve.mean, step.voltage_v + drop_v);
-    // All SOCs within reach are equally likely. The prior is centred at the SOC that the voltage gives. The update then
-    // linearises the curve there.
+    // All SOCs within reach are equally likely. The prior is centred at the SOC that the voltage gives, so that the
+    // update linearises the curve there.
     let within_reach = |soc: f64| soc.clamp(before_soc - reach, before_soc + reach);
     used.mean[0] = within_reach(soc);
     let by_used = update(&mut used)?;
-    // On a flat part of the curve, the slope at one SOC says little: a small error of the voltage leads to a distant
-    // SOC.
+    // On a flat part of the curve, a small voltage error leads to a distant SOC, so the slope at one SOC is not enough.
     let voltage_variance = square(config.sensor.voltage_offset_v)
         + square(config.gate.model_error_v)
         + branch_variance
@@ -85,8 +87,8 @@ pub(super) fn update_after_downtime(
     Some(if weight > 0.5 { by_used } else { by_left_alone })
 }
 
-/// Prior of the hypothesis that the cell was used: the SOC is anywhere within reach and uncorrelated, and the branches
-/// are as uncertain as at a start.
+/// Prior of the second hypothesis: the SOC is anywhere within reach and uncorrelated, and the branches are as uncertain
+/// as at a start.
 fn used_prior(x: &Gaussian, config: &EstimatorConfig, downtime_std: f64) -> Gaussian {
     let mut used = *x;
     used.covariance[(0, 0)] = widened(x.marginal(0).variance, square(downtime_std));

@@ -1,7 +1,7 @@
 //! Mean and covariance of one cell's state, for any number of branches.
 //!
-//! In and out: values in the units of the states. Inputs are not checked; [`Gaussian::is_possible`] says whether a cell
-//! can have the state.
+//! Values have the units of the states. Inputs are not checked. A constant error does not change with time, for example
+//! the offset of a sensor.
 
 use nalgebra::{SMatrix, SVector};
 
@@ -12,7 +12,6 @@ use crate::cell::MAX_BRANCHES;
 use crate::filter::ScalarGaussian;
 use crate::quantity::bounds;
 
-/// Number of states of a cell with [`MAX_BRANCHES`] branches.
 pub(super) const MAX_STATES: usize = BRANCHES + MAX_BRANCHES;
 
 pub(super) type Covariance = SMatrix<f64, MAX_STATES, MAX_STATES>;
@@ -20,7 +19,7 @@ pub(super) type Covariance = SMatrix<f64, MAX_STATES, MAX_STATES>;
 /// Mean and covariance of a cell's state. Elements from index `states` on are 0.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Gaussian {
-    /// Number of states: 3, and one per branch.
+    /// Three, plus one per branch.
     pub(super) states: usize,
     pub(super) mean: SVector<f64, MAX_STATES>,
     /// Covariance without the constant errors, symmetric and positive definite.
@@ -29,18 +28,17 @@ pub(super) struct Gaussian {
     pub(super) by_constant: SMatrix<f64, MAX_STATES, CONSTANT_ERRORS>,
 }
 
-/// Learned quantities that a restart keeps.
 pub(super) struct LearnedState {
     pub(super) log_resistance: ScalarGaussian,
     pub(super) capacity: ScalarGaussian,
     /// Covariance of ln rho and the capacity, without the constant errors.
     pub(super) covariance: f64,
-    /// Errors of ln rho and of the capacity caused by the constant errors.
+    /// Errors of ln rho and of the capacity that the constant errors have caused.
     pub(super) by_constant: SMatrix<f64, 2, CONSTANT_ERRORS>,
 }
 
 impl Gaussian {
-    /// The state at a start: new SOC and branches, learned resistance and capacity.
+    /// The state at a start: new SOC and branch voltages, learned resistance and capacity.
     pub(super) fn at_start(soc: ScalarGaussian, branch_variance: &[f64], learned: &LearnedState) -> Self {
         let states = BRANCHES + branch_variance.len();
         let (mut mean, mut by_constant) = (SVector::zeros(), SMatrix::<f64, MAX_STATES, CONSTANT_ERRORS>::zeros());
@@ -59,7 +57,6 @@ impl Gaussian {
         x
     }
 
-    /// Sets the covariance of two states.
     pub(super) fn correlate(&mut self, i: usize, j: usize, covariance: f64) {
         (self.covariance[(i, j)], self.covariance[(j, i)]) = (covariance, covariance);
     }
@@ -70,7 +67,7 @@ impl Gaussian {
         ScalarGaussian { mean: self.mean[i], variance }
     }
 
-    /// Whether a cell can have the state; otherwise the filter restarts.
+    /// Whether a cell can have the state. If not, the filter restarts.
     pub(super) fn is_possible(&self) -> bool {
         bounds::FILTER_SOC.has(self.mean[0])
             && bounds::LOG_RESISTANCE.has(self.mean[LOG_RESISTANCE])
@@ -79,22 +76,22 @@ impl Gaussian {
             && (0..self.states).all(|i| (1e-40..=bounds::NUMBER.high).contains(&self.covariance[(i, i)]))
     }
 
-    /// Corrects the mean by `deviations` standard deviations of a constant error. The standard deviation of the error
-    /// is multiplied by `remains`.
+    /// Corrects the mean by `deviations` standard deviations of a constant error, and multiplies the standard deviation
+    /// of the error by `remains`.
     pub(super) fn absorb(&mut self, constant_error: usize, deviations: f64, remains: f64) {
         let column = self.by_constant.column(constant_error).into_owned();
         self.mean += column * deviations;
         if remains <= 1.0 {
             self.by_constant.set_column(constant_error, &(column * remains));
         } else {
-            // The added part of the error is new and has not moved any state.
+            // The error grows. The added part is new, so it has not moved any state.
             self.by_constant.set_column(constant_error, &(column / remains));
             self.covariance += column * column.transpose() * (1.0 - 1.0 / square(remains));
         }
     }
 
-    /// Raises the uncertainty after a gap of unknown length: the SOC is unknown, and the branches are anywhere between
-    /// loaded and relaxed.
+    /// Raises the uncertainty after a gap of unknown length. The SOC is unknown, and the branches are between loaded
+    /// and relaxed.
     pub(super) fn widen_after_unknown_gap(&mut self) {
         self.covariance[(0, 0)] = widened(self.covariance[(0, 0)], UNKNOWN_SOC_VARIANCE);
         for i in BRANCHES..self.states {
@@ -103,7 +100,6 @@ impl Gaussian {
         }
     }
 
-    /// Removes all correlations of state `i` with other states and with the constant errors.
     pub(super) fn isolate(&mut self, i: usize) {
         let variance = self.covariance[(i, i)];
         self.covariance.row_mut(i).fill(0.0);
@@ -113,7 +109,7 @@ impl Gaussian {
     }
 
     /// Replaces this Gaussian by its mixture with `other`, which has the weight `weight`. The difference between their
-    /// constant errors is ignored, because it is small compared with the difference between their means.
+    /// constant errors is small compared with the difference between their means, so it is ignored.
     pub(super) fn merge(&mut self, other: &Self, weight: f64) {
         let apart = other.mean - self.mean;
         let between = apart * apart.transpose();

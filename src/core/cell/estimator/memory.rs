@@ -1,8 +1,8 @@
 //! The estimator's memory: rest, load, consistency, rejected readings, and the estimates that a restart of the filter
 //! keeps.
 //!
-//! In: steps (A, s) and the outcomes of updates. Out: the time that a reading represents (s) the load (A) and whether
-//! the filter must restart. Stored numbers are checked ([`Memory::check`]).
+//! In: steps (A, s) and the outcomes of updates. Out: the time that a reading represents (s), the load (A), and whether
+//! the filter must restart.
 
 use serde::{Deserialize, Serialize};
 
@@ -15,21 +15,21 @@ use crate::filter::{Measurement, ScalarGaussian};
 use crate::quantity::InvalidState;
 use crate::quantity::bounds::{self, Bounds};
 
-/// If there is a load before or after a gap, the gap counts as at least this load, per rated capacity: 1 C.
+/// If a load flows before or after a gap, at least this load is assumed during the gap: 1 C.
 const GAP_LOAD_PER_H: f64 = 1.0;
 
 /// Prior probability that a cell was used while the program did not run.
 pub(super) const USED_PRIOR: f64 = 0.2;
 
-/// Prior probability of use in a gap with a load before or after it: the load continued or ended, with equal
+/// Prior probability of use in a gap with a load before or after it. The load continued or ended with equal
 /// probability.
 const LOADED_PRIOR: f64 = 0.5;
 
-/// Prior probability of use in a gap of at least half a day with rest before and after it. A charger may work while the
-/// bus sleeps, but this is rare, because a bus in use wakes its listeners.
+/// Prior probability that a charger worked in a gap of at least half a day with rest before and after it. This is rare,
+/// because a bus in use wakes its listeners.
 const CHARGER_PRIOR: f64 = 0.05;
 
-/// If a downtime adds at most this standard deviation to the SOC, fraction, the downtime is negligible.
+/// A downtime is negligible if its SOC change has at most this standard deviation (fraction).
 const NEGLIGIBLE_STD: f64 = 0.002;
 
 /// State of the estimator in addition to its filter.
@@ -43,7 +43,7 @@ pub(super) struct Memory {
     pub(super) log_resistance: ScalarGaussian,
     pub(super) temperature_c: Option<f64>,
     pub(super) last_current_a: f64,
-    /// Low-pass of |current| with the time constant `load_memory_s` (A): the load that still drives slow diffusion.
+    /// Low-pass of |current| (A) with the time constant `load_memory_s`: the load that still drives slow diffusion.
     pub(super) load_a: f64,
     /// Mean normalised innovation squared over the consistency window.
     pub(super) mean_nis: f64,
@@ -52,31 +52,27 @@ pub(super) struct Memory {
     /// Time that the next voltage reading represents (s): the time since the last used reading. A long rest counts
     /// less.
     pub(super) information_s: f64,
-    /// Duration of the present rest (s).
     pub(super) rest_s: f64,
-    /// Information about the current sensor's offset since the last correction of the offset: sum of d^2 / R. d is the
-    /// effect of one standard deviation of the offset on an innovation; R is the variance of the innovation without
-    /// this effect.
+    /// Information about the current sensor's offset since its last correction: sum of d^2 / R. d is the effect of one
+    /// standard deviation of the offset on an innovation. R is the variance of the innovation without this effect.
     pub(super) offset_information: f64,
     /// Evidence about the current sensor's offset from the same voltages: sum of d x innovation / R.
     pub(super) offset_score: f64,
     pub(super) slow_branch: SlowBranch,
-    /// Standard deviation of the SOC change during downtime. It counts until a voltage has been used.
+    /// Standard deviation of the SOC change (fraction) during downtime, until a voltage is used.
     pub(super) downtime_std: f64,
     /// Part of the next unmeasured time that has already been noted as downtime (s).
     pub(super) noted_s: f64,
-    /// Probability that the cell was used during the downtime.
     pub(super) used_prior: f64,
-    /// Whether the current was unknown at the last reading, so that an unmeasured stretch continues.
+    /// Whether the current was unknown at the last reading.
     pub(super) is_current_unknown: bool,
     /// While the current is unknown: SOC according to the latest voltage alone.
     #[serde(default)]
     pub(super) by_voltage: Option<ScalarGaussian>,
     /// Whether no voltage has been used since the last sleep or unknown gap.
     pub(super) is_unseen: bool,
-    /// Whether the SOC is unknown after a gap of unknown length. If so, the filter restarts from the next voltage.
+    /// After a gap of unknown length, the SOC is unknown, and the filter restarts from the next voltage.
     pub(super) is_soc_unknown: bool,
-    /// Number of consecutive readings beyond the gate.
     pub(super) rejected: u32,
     /// Duration of the run of rejected readings (s).
     pub(super) rejected_s: f64,
@@ -85,7 +81,6 @@ pub(super) struct Memory {
 }
 
 impl Memory {
-    /// The memory before the first measurement.
     pub(super) fn new(config: &EstimatorConfig) -> Self {
         let (capacity, log_resistance) = configured(config);
         Self {
@@ -115,17 +110,17 @@ impl Memory {
         }
     }
 
-    /// Adds a downtime. `used` is the probability that the cell was used; `most` is the maximum SOC change, fraction.
+    /// Adds a downtime. `used`: probability that the cell was used. `most`: maximum SOC change (fraction).
     pub(super) fn note_downtime(&mut self, most: f64, used: f64) {
         self.downtime_std = (self.downtime_std + most / 3.0_f64.sqrt()).min(1.0);
         self.used_prior = 1.0 - (1.0 - self.used_prior) * (1.0 - used);
         self.by_voltage = None;
     }
 
-    /// The published SOC. `soc`: the SOC of the filter. Its variance grows by the downtime. While the current is unknown,
-    /// the latest voltage also counts. The filter itself does not use this voltage: the same unknown current is part of
-    /// all readings, so their errors do not average out. A voltage without a current cannot make the SOC more certain
-    /// than it was when the current was last known.
+    /// The published SOC, given the `soc` of the filter. Downtime raises the variance. While the current is unknown,
+    /// the latest voltage also counts. The filter does not use this voltage: all readings contain the same unknown
+    /// current, so their errors do not average out. A voltage without a current cannot make the SOC more certain than
+    /// it was when the current was last known.
     pub(super) fn published(&self, soc: ScalarGaussian) -> ScalarGaussian {
         let known = soc.variance;
         let variance = self.downtime_std_if_any().map_or(known, |std| widened(known, square(std)));
@@ -137,9 +132,9 @@ impl Memory {
         soc
     }
 
-    /// Determines the SOC according to the voltage of a step without a known current. Every current up to the last
-    /// known current, and up to [`GAP_LOAD_PER_H`], is equally likely in both directions. `log_resistance`: ln of the
-    /// resistance relative to new.
+    /// Determines the SOC from the voltage of a step without a known current. The largest possible current is the last
+    /// known current, but at least [`GAP_LOAD_PER_H`]. Every smaller current is equally likely in both directions.
+    /// `log_resistance`: ln of the resistance relative to a new cell.
     pub(super) fn note_voltage(
         &mut self,
         model: &CellModel,
@@ -163,10 +158,11 @@ impl Memory {
         self.by_voltage = Some(ScalarGaussian { mean, variance: square(std).max(KNOWN_VARIANCE) });
     }
 
-    /// Notes the unmeasured time of a step. The load before or after this time may have continued through it, or a
-    /// charger may have been connected. The next voltage with a known current decides whether this happened. If the
-    /// current is known before and after the unmeasured time and the possible change of the SOC is negligible, no
-    /// downtime is noted. The standard deviation of the change (fraction of SOC) is returned instead.
+    /// Notes the unmeasured time of a step. The load before or after this time may have continued, or a charger may
+    /// have been connected. The next voltage with a known current decides whether this happened.
+    ///
+    /// If the current is known before and after the unmeasured time and the possible change of the SOC is negligible,
+    /// no downtime is noted. The standard deviation of the change (fraction of SOC) is returned instead.
     pub(super) fn note_gap(&mut self, config: &EstimatorConfig, step: &CellStep, capacity_ah: f64) -> f64 {
         let noted_s = std::mem::take(&mut self.noted_s).min(step.unmeasured_s);
         let is_unknown = step.current_a.is_none() && step.unmeasured_s > 0.0;
@@ -180,8 +176,8 @@ impl Memory {
         }
         let load_per_s = if is_loaded { adjacent_a / (3600.0 * capacity_ah) } else { 0.0 };
         let away_per_s = config.gap.away_use_per_s;
-        // A cell that reports its voltage is awake, so use may start at any time. In silent gaps shorter than an hour,
-        // slow relaxation would be mistaken for a charger.
+        // While the cell reports its voltage, it is awake, so use may start at any time. In a silent gap shorter than
+        // an hour, slow relaxation would be mistaken for a charger.
         let use_per_s = if continues || unnoted_s >= 3600.0 { away_per_s } else { 0.0 };
         let most = load_per_s.max(use_per_s) * step.unmeasured_s - away_per_s * noted_s;
         if most <= 0.0 {
@@ -194,7 +190,7 @@ impl Memory {
         let used_at_rest = CHARGER_PRIOR * (unnoted_s / 43_200.0).min(1.0);
         let used = if is_loaded { LOADED_PRIOR } else { used_at_rest };
         if continues {
-            // One unknown current flows through the whole stretch: its charge grows linearly, and the stretch counts as
+            // One unknown current flows through the whole stretch. Its charge grows linearly, and the stretch counts as
             // one gap.
             self.downtime_std = (self.downtime_std + std).min(1.0);
             self.used_prior = self.used_prior.max(used.max(USED_PRIOR));
@@ -204,8 +200,7 @@ impl Memory {
         0.0
     }
 
-    /// The load before or after a step's gap (A) which may have continued through the gap. 0 if the cell counts as
-    /// resting while the bus is silent.
+    /// The load (A) before or after a step's gap, whichever is larger. 0 if the cell counts as resting in the gap.
     fn gap_load_a(&self, config: &EstimatorConfig, step: &CellStep) -> f64 {
         if is_silent_rest(config, step) {
             return 0.0;
@@ -213,8 +208,8 @@ impl Memory {
         self.last_current_a.abs().max(step.current_a.unwrap_or(0.0).abs())
     }
 
-    /// Updates load and rest for the unmeasured time of a step. The unmeasured time follows the measured time. If there
-    /// is a load before or after the gap, the gap counts as a load of at least 1 C.
+    /// Updates load and rest for the unmeasured time of a step, which follows the measured time. If a load flows before
+    /// or after the gap, the gap counts as a load of at least 1 C.
     pub(super) fn pass_gap(&mut self, model: &CellModel, config: &EstimatorConfig, step: &CellStep) {
         self.rest_s = 0.0;
         self.load_a *= libm::exp(-step.unmeasured_s / config.voltage.load_memory_s);
@@ -224,8 +219,7 @@ impl Memory {
         }
     }
 
-    /// Standard deviation of the SOC change during downtime, if no voltage has been used since; `None` if it is
-    /// negligible.
+    /// Standard deviation of the SOC change during downtime since the last used voltage; `None` if it is negligible.
     #[inline]
     pub(super) fn downtime_std_if_any(&self) -> Option<f64> {
         (self.downtime_std > NEGLIGIBLE_STD).then_some(self.downtime_std)
@@ -244,8 +238,8 @@ impl Memory {
         self.is_unseen || self.downtime_std_if_any().is_some()
     }
 
-    /// Adds an update to the consistency monitor (mean of the normalised innovation squared, with exponentially
-    /// decreasing weights) and to the run of rejected readings.
+    /// Adds an update to the run of rejected readings and to the consistency monitor (exponentially weighted mean of
+    /// the normalised innovation squared).
     #[inline]
     pub(super) fn record_update(&mut self, config: &EstimatorConfig, step: &CellStep, update: &Update) {
         let elapsed_s = step.measured_s + step.unmeasured_s;
@@ -255,7 +249,7 @@ impl Memory {
             self.innovation_v = update.innovation;
             (self.information_s, self.rejected, self.rejected_s) = (0.0, 0, 0.0);
         } else {
-            // The time before the first rejected reading is not part of the run.
+            // The run starts at the first rejected reading.
             if self.rejected == 0 {
                 (self.rejected_s, self.rejected_after_gap) = (0.0, step.unmeasured_s > 0.0);
             } else {
@@ -274,7 +268,7 @@ impl Memory {
         long_enough || (self.rejected_after_gap && self.rejected >= 2)
     }
 
-    /// Resets an unusable capacity or resistance to its configured value; otherwise the filter would restart at every
+    /// Resets an unusable capacity or resistance to its configured value. Otherwise, the filter would restart at every
     /// reading.
     pub(super) fn reset_unusable(&mut self, config: &EstimatorConfig) {
         let (capacity, log_resistance) = configured(config);
@@ -289,7 +283,6 @@ impl Memory {
         }
     }
 
-    /// Checks stored numbers. The error names the first impossible number.
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         InvalidState::unless_capacity("the capacity a cell's reset keeps", self.capacity.mean)?;
         check_log_resistance(self.log_resistance.mean)?;
@@ -327,18 +320,15 @@ impl Memory {
     }
 }
 
-/// Whether, according to the configuration, the cell rested in the unmeasured time of a step.
 fn is_silent_rest(config: &EstimatorConfig, step: &CellStep) -> bool {
     // If the current has not been measured for more than 5 s, the bus counts as silent.
     config.gap.silence_is_rest && step.unmeasured_s > 5.0
 }
 
-/// Checks a stored ln of a resistance ratio.
 pub(super) fn check_log_resistance(log_resistance: f64) -> Result<(), InvalidState> {
     bounds::LOG_RESISTANCE.check("ln of a cell's resistance ratio", log_resistance)
 }
 
-/// Configured initial capacity (Ah) and ln(resistance).
 fn configured(config: &EstimatorConfig) -> (ScalarGaussian, ScalarGaussian) {
     let capacity_variance = match config.capacity_state {
         CapacityState::Joint => square(config.initial.capacity_std_ah),

@@ -1,8 +1,8 @@
 //! The estimators of a pack whose modules may have different cells: one [`EstimatorBank`] for the pack's own cells, and
-//! one per replaced module. The cells of one bank are called a kind.
+//! one per replaced module. The cells of a bank are called a kind.
 //!
-//! In: one [`CellStep`] per cell and batch, by the cell's index in the pack. Out: results and estimates per cell, like
-//! an [`EstimatorBank`]. All kinds share the current sensor, so its offset is learned for the whole pack.
+//! In: one [`CellStep`] per cell and batch, by the cell's index in the pack. Out: results and estimates per cell. All
+//! kinds share the current sensor, so its offset is learned for the whole pack.
 
 use super::bank::EstimatorBank;
 use super::cell_estimator::CellEstimator;
@@ -11,7 +11,7 @@ use crate::cell::{CellModel, EstimatorConfig, MAX_BRANCHES};
 use crate::filter::ScalarGaussian;
 use crate::quantity::CellIndex;
 
-/// A replaced module, whose cells are of another kind than the pack's.
+/// A replaced module, whose cells differ from the pack's own cells.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CellModule {
     /// The cells, ascending; no cell is in two modules.
@@ -20,11 +20,10 @@ pub struct CellModule {
     pub model: CellModel,
     /// The pack's estimator settings with the initial capacity of this model.
     pub estimator: EstimatorConfig,
-    /// Whether the model is from a file; otherwise, it is from the label.
+    /// Whether the model comes from a file; otherwise, it comes from the label.
     pub is_given: bool,
 }
 
-/// Where the estimator of a cell is stored.
 #[derive(Debug, Clone, Copy)]
 struct Place {
     bank: usize,
@@ -36,16 +35,14 @@ struct Place {
 pub struct PackBank {
     /// The bank of the pack's own cells, then one bank per module.
     banks: Vec<EstimatorBank>,
-    /// Place of each cell of the pack.
     places: Vec<Place>,
     /// The pack's own cells, ascending.
     own: Vec<usize>,
-    /// Whether the model of each module is from a file.
     is_given: Vec<bool>,
 }
 
 impl PackBank {
-    /// Estimators of `cells` cells before their first measurement; cells outside the modules have `model`.
+    /// Estimators of `cells` cells before their first measurement. Cells outside the modules use `model`.
     ///
     /// # Panics
     /// If a module has a cell that the pack does not have.
@@ -70,7 +67,7 @@ impl PackBank {
         }
     }
 
-    /// Replaces settings and tables for the same cells and modules. Each model must have as many branches as before.
+    /// Replaces settings and tables for the same cells and modules. No model may change its number of branches.
     pub fn reconfigure(&mut self, model: &CellModel, config: &EstimatorConfig, modules: &[CellModule]) {
         self.banks[0].reconfigure(model, config);
         for (bank, module) in self.banks[1..].iter_mut().zip(modules) {
@@ -106,7 +103,7 @@ impl PackBank {
         self.places[cell].bank == 0
     }
 
-    /// Model and settings of each kind of cell, the pack's own first.
+    /// Model and settings of each kind of cell, starting with the pack's own cells.
     pub fn kinds(&self) -> impl Iterator<Item = (&CellModel, &EstimatorConfig)> {
         self.banks.iter().map(|bank| (bank.model(), bank.config()))
     }

@@ -1,55 +1,53 @@
-//! Learns, for each cell, the resistance ratio of the slowest branch, in addition to the resistance ratio of the whole
+//! Learns a resistance ratio for the slowest branch of each cell, in addition to the resistance ratio of the whole
 //! cell.
 //!
-//! In: evidence from innovations. Out: the ratio and its standard deviation. Diffusion and the electrolyte determine
-//! the slowest branch. They vary between cells and age differently from the contacts and the charge transfer. The
-//! resistance of contacts and charge transfer mostly determines the state
-//! [`LOG_RESISTANCE`](super::state_vector::LOG_RESISTANCE). A wrong voltage of the slowest branch would be mistaken for
+//! In: evidence from innovations. Out: the ratio and its standard deviation. If a model has a single branch, this
+//! branch covers all time constants, so its ratio stays 1.
+//!
+//! Reason: diffusion and electrolyte determine the slowest branch. They vary between cells, and they age differently
+//! from contacts and charge transfer. The state [`LOG_RESISTANCE`](super::state_vector::LOG_RESISTANCE) mostly follows
+//! contacts and charge transfer. Without a separate ratio, a wrong voltage of the slowest branch would be mistaken for
 //! charge.
 //!
-//! Source: Friedland (1969), separate estimation of a bias, as for the offset of the current sensor
-//! ([`crate::health::offset`]). The ratio is corrected when the mode changes. If a model has a single branch, this
-//! branch covers all time constants, and its ratio stays 1.
+//! Source: Friedland (1969), separate estimation of a bias, as in [`crate::health::offset`].
 
 use serde::{Deserialize, Serialize};
 
 use crate::quantity::InvalidState;
 
-/// Minimum standard deviation of the ratio, relative to the configured standard deviation. The ratio changes with
-/// temperature and SOC, so evidence does not last.
+/// Minimum standard deviation of the ratio, relative to the configured standard deviation. Old evidence loses its
+/// validity because the ratio changes with temperature and SOC.
 const LEAST_PART: f64 = 0.5;
 
-/// Maximum information between two corrections, relative to the information 1 / variance of the ratio itself. The
-/// errors of the model repeat from voltage to voltage, so many voltages give hardly more information than one.
+/// Maximum information that one correction uses, relative to 1 / variance of the ratio. The errors of the model repeat
+/// from voltage to voltage, so many voltages give hardly more information than one.
 const MAX_INFORMATION: f64 = 0.3;
 
-/// Minimum and maximum ratio.
 const RANGE: (f64, f64) = (0.05, 3.0);
 
 /// The learned ratio, and the evidence since its last correction.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct SlowBranch {
-    /// Voltage of the cell's slowest branch, divided by the voltage that the model and the cell's common resistance
-    /// ratio give for this branch.
+    /// Voltage of the cell's slowest branch, divided by its voltage according to the model and the cell's resistance
+    /// ratio.
     pub(super) ratio: f64,
     /// Standard deviation of the ratio, relative to the configured standard deviation.
     pub(super) part: f64,
-    /// Sum of d^2 / R. d is the effect of one standard deviation of the ratio on an innovation; R is the variance of
-    /// the innovation without this effect.
+    /// Sum of d^2 / R, where d is the effect of one standard deviation of the ratio on an innovation, and R is the
+    /// variance of the innovation without this effect.
     pub(super) information: f64,
     /// Sum of d x innovation / R.
     pub(super) score: f64,
 }
 
-/// A correction of the ratio. `deviations` is the change of the ratio, divided by its standard deviation before the
-/// correction.
+/// A correction of the ratio.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Correction {
     pub(super) deviations: f64,
     /// Factor by which the evidence reduces the standard deviation of the ratio.
     pub(super) remains: f64,
-    /// Factor that then raises the standard deviation to its minimum, [`LEAST_PART`]; 1 if it is not below the minimum.
+    /// Factor that then raises the standard deviation to its minimum [`LEAST_PART`]; 1 if this is not necessary.
     pub(super) widened: f64,
 }
 
@@ -60,13 +58,13 @@ impl Default for SlowBranch {
 }
 
 impl SlowBranch {
-    /// Standard deviation of the ratio. `configured` is its standard deviation before any evidence.
+    /// Standard deviation of the ratio. `configured` is the standard deviation without evidence.
     #[inline]
     pub(super) fn std(&self, configured: f64) -> f64 {
         self.part * configured
     }
 
-    /// Corrects the ratio by the evidence and clears the evidence. `None` if there is no usable evidence.
+    /// Corrects the ratio with the evidence and clears the evidence. Returns `None` if the evidence is not usable.
     pub(super) fn correct(&mut self, configured: f64) -> Option<Correction> {
         let (information, score) = (self.information, self.score);
         (self.information, self.score) = (0.0, 0.0);
@@ -74,8 +72,7 @@ impl SlowBranch {
         if !(information > 0.0 && information.is_finite() && score.is_finite() && std > 0.0) {
             return None;
         }
-        // If the evidence deviates from its expectation by more than two standard deviations, the excess has another
-        // cause.
+        // Evidence beyond two standard deviations has another cause, so the score is limited.
         let most = 2.0 * (information * (1.0 + information)).sqrt();
         let counted = information.min(MAX_INFORMATION) / information;
         let (information, score) = (counted * information, counted * score.clamp(-most, most));
@@ -89,7 +86,6 @@ impl SlowBranch {
         Some(correction)
     }
 
-    /// Checks stored numbers. The error names the first impossible number.
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         let (low, high) = RANGE;
         InvalidState::unless(
@@ -117,8 +113,7 @@ mod tests {
     fn evidence_corrects_ratio_once() {
         let mut slow = SlowBranch { information: 0.25, score: -0.25, ..SlowBranch::default() };
         let correction = slow.correct(0.4).expect("evidence");
-        // If the evidence for a change by one standard deviation has a quarter of the prior's information, the ratio
-        // moves by a fifth of a standard deviation.
+        // Information of 0.25, relative to the prior, moves the ratio by 0.25 / 1.25 of a standard deviation.
         assert!((correction.deviations + 0.2).abs() < 1e-12, "{correction:?}");
         assert!((correction.remains - 0.8_f64.sqrt()).abs() < 1e-12 && correction.widened == 1.0, "{correction:?}");
         assert!((slow.ratio - 0.92).abs() < 1e-12, "{slow:?}");

@@ -1,7 +1,7 @@
-//! The estimator's state as a document, for storing and restoring.
+//! Stores and restores the state of an estimator as a document.
 //!
 //! In: an estimator, or a stored document. Out: the document, or the restored estimator. [`CellState::check`] rejects
-//! numbers that no filter can use; a covariance that is not positive definite loses its correlations.
+//! numbers that no filter can use. If a stored covariance is not positive definite, its correlations are dropped.
 
 use nalgebra::{SMatrix, SVector};
 use serde::{Deserialize, Serialize};
@@ -19,15 +19,15 @@ use crate::quantity::bounds;
 pub struct CellState {
     /// Mean of the filter's state in the order [SOC, U_1 .. U_n, ln rho, C]; empty before the first voltage.
     mean: Vec<f64>,
-    /// Covariance in the same order, row by row.
+    /// Row by row, with the states in the same order as in `mean`.
     covariance: Vec<f64>,
-    /// Effect of the constant errors (see `Gaussian::by_constant`): for each number of `mean`, one value per constant
-    /// error.
+    /// Effect of the constant errors, such as a sensor offset (see `Gaussian::by_constant`): one value per constant
+    /// error for each state in `mean`.
     by_constant: Vec<f64>,
     memory: Memory,
 }
 
-/// Converts an index in the document's state, which has `n` numbers, to the index in the filter's state.
+/// Converts an index in the document, which has `n` states, to the index in the filter.
 const fn place_of(i: usize, n: usize) -> usize {
     match i {
         0 => 0,
@@ -44,10 +44,11 @@ impl CellEstimator {
         CellState { mean, covariance, by_constant, memory: self.memory }
     }
 
-    /// Restores a stored state. `None` if the stored state has a different number of branches or inconsistent lengths.
+    /// Restores a stored state. Returns `None` if the number of branches is not `branches`, or if the lengths do not
+    /// fit.
     ///
-    /// If rounding has made a covariance inconsistent, the covariance loses its correlations and keeps its variances. A
-    /// filter with an impossible SOC is discarded and starts from the next voltage.
+    /// If rounding has made the covariance inconsistent, only its variances are kept. If the SOC is impossible, the
+    /// filter is discarded and starts from the next voltage.
     pub fn restore(state: &CellState, branches: usize) -> Option<Self> {
         let filter = match (state.mean.len(), branches) {
             (0, _) => None,

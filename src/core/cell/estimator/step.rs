@@ -1,23 +1,22 @@
 //! Input and outcome of one step of the estimator.
 
-/// A voltage reading, with charge and time since the previous reading.
+/// A voltage reading, and the charge and time since the previous reading.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CellStep {
     /// Time with a measured current (s).
     pub measured_s: f64,
-    /// Charge taken out in the measured time (A) s.
+    /// Charge taken out in the measured time (A s).
     pub charge_as: f64,
-    /// Part of the measured time in which the charge contains the current sensor's offset (s). Readings of exactly zero
+    /// Part of the measured time (s) in which the charge contains the current sensor's offset. Readings of exactly zero
     /// contain no offset.
     pub offset_s: f64,
-    /// Time without a current measurement (s) (asleep, sensor lost).
+    /// Time without a current measurement (s), for example during sleep.
     pub unmeasured_s: f64,
-    /// Cell current at the reading (A). If it is unknown (`None`), the voltage moves the published SOC, but not the
-    /// filter.
+    /// Cell current at the reading (A). If it is `None`, the voltage changes the published SOC, but not the filter.
     pub current_a: Option<f64>,
-    /// Cell temperature (degrees C). If it is unknown (`None`), the thermal model predicts it.
+    /// Cell temperature (degrees C). If it is `None`, the thermal model predicts it.
     pub temperature_c: Option<f64>,
-    /// Temperature of the surroundings for the thermal model (degrees C).
+    /// Ambient temperature for the thermal model (degrees C).
     pub ambient_c: f64,
     /// Terminal voltage (V).
     pub voltage_v: f64,
@@ -32,8 +31,8 @@ pub struct Update {
     pub innovation: f64,
     /// Predicted variance of the innovation (V^2).
     pub innovation_variance: f64,
-    /// Square of the innovation, divided by the variance that the gate uses. If this ratio exceeds the square of the
-    /// gate's width (in standard deviations), the reading is an outlier.
+    /// Square of the innovation, divided by the variance that the gate uses. The reading is an outlier if this ratio
+    /// exceeds the square of the gate's width in standard deviations.
     pub test_ratio: f64,
     /// Whether the innovation passed the gate and moved the state.
     pub accepted: bool,
@@ -42,10 +41,10 @@ pub struct Update {
 /// Outcome of a step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StepResult {
-    /// The measurement update; `None` without a known current, or if the step could not be computed.
+    /// The update with the voltage; `None` without a known current, or if the step could not be computed.
     pub update: Option<Update>,
     /// Whether the filter was restarted from the voltage.
     pub reset: bool,
-    /// Whether the SOC has changed over a gap by far more than the counted charge and the earlier uncertainty explain.
+    /// Whether the SOC has changed over a gap by far more than counted charge and earlier uncertainty explain.
     pub jumped: bool,
 }

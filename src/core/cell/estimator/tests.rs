@@ -1,4 +1,4 @@
-//! Tests the estimator on a simulated cell that follows the estimator's own model, without noise.
+//! Tests the estimator on a simulated cell that follows the estimator's own model without noise.
 
 mod robust;
 pub(super) mod textbook;
@@ -55,7 +55,6 @@ pub(crate) fn config() -> EstimatorConfig {
 }
 
 impl CellEstimator {
-    /// Makes a step in a bank of one cell.
     pub(crate) fn step(&mut self, model: &CellModel, config: &EstimatorConfig, step: &CellStep) -> StepResult {
         let mut bank = EstimatorBank::new(model, config, 1);
         bank.put(0, self);
@@ -194,10 +193,10 @@ fn unmeasured_load_widens_soc_unless_voltage_known() {
     let lost = CellStep { unmeasured_s: 1800.0, current_a: None, is_voltage_frozen: true, ..rest };
     let result = estimator.step(&model, &config, &lost);
     assert_eq!(result.update, None);
-    // 1 A for half an hour takes 0.5 Ah out of 1.7 Ah: 0.29 of SOC.
+    // In half an hour, 1 A takes 0.5 Ah out of 1.7 Ah, which is 0.29 of SOC.
     let without = soc(&estimator);
     assert!(without.std() > before.std() + 0.1, "{without:?}");
-    // The drop of an unknown current of up to 1 C, in both directions, is the error of the voltage.
+    // The voltage error includes the drop of an unknown current of up to 1 C in either direction.
     let open = CellStep { unmeasured_s: 1.0, is_voltage_frozen: false, ..lost };
     (0..1000).for_each(|_| _ = estimator.step(&model, &config, &open));
     let with = soc(&estimator);
@@ -212,7 +211,7 @@ fn voltage_finds_soc_while_current_lost() {
     let (config, mut truth, model) = (config(), truth(), small_model());
     let mut estimator = CellEstimator::new(&config);
     cycle(&mut estimator, &config, &mut truth, 1.0, 1.0);
-    // 40 min of a discharge with 1 A, of which nothing is measured.
+    // A discharge with 1 A for 40 min, in which no current is measured.
     let (start, before) = (truth.soc, soc(&estimator));
     for _ in 0..2400 {
         let moved = truth.step(&model, 1.0, 1.0);
@@ -245,8 +244,8 @@ fn lost_current_widens_soc_linearly() {
         };
         estimator.step(&model, &config, &lost);
     }
-    // A constant current has flowed while no current was measured. Every current between 0 and the load before that
-    // time is equally likely.
+    // The unmeasured current is assumed to be constant. Each current between 0 and the last known load is equally
+    // likely.
     let load_std = 1200.0 / (3600.0 * capacity_ah) / 3.0_f64.sqrt();
     let added = (soc(&estimator).variance - before.variance).sqrt();
     assert!((added / load_std - 1.0).abs() < 0.05, "{added} {load_std}");
@@ -267,7 +266,7 @@ fn slowest_branch_ratio_is_learned() {
             for k in 0..240 {
                 let current_a = if k < 80 { 0.0 } else { current_a };
                 let mut step = truth.step(&model, current_a, 15.0);
-                // The cell's slow branch has half of the resistance that the model states.
+                // The slow branch of the simulated cell has half of the model's resistance.
                 let position = model.grid_position(truth.soc, 25.0);
                 let branch = BranchAt::new(&model, 1, &position, 0.5 * truth.ratio);
                 slow_v = branch.voltage_after(Discretisation::Exact, slow_v, current_a, 15.0);
@@ -307,8 +306,7 @@ fn unknown_soc_variance_is_limited() {
 fn unseen_charge_moves_soc_not_capacity() {
     let (mut config, model) = (config(), small_model());
     config.gap.away_use_per_s = 0.5 / 3600.0;
-    // Discharges of a tenth of the capacity are measured, the charges between them are not. A load of C/20 flows before
-    // and after each gap.
+    // Only the discharges are measured, not the charges between them. Before and after each gap, a load of C/20 flows.
     let mut truth = Truth { soc: 0.8, branch_v: 0.0, capacity_ah: 2.0, ratio: 1.0 };
     let mut estimator = CellEstimator::new(&config);
     for _ in 0..40 {
@@ -333,7 +331,7 @@ fn silent_gap_is_rest_if_configured() {
         config.gap.silence_is_rest = silence_is_rest;
         let mut estimator = CellEstimator::new(&config);
         cycle(&mut estimator, &config, &mut truth, 1.0, 0.1);
-        // The voltage comes without a current, so the filter learns nothing from it.
+        // The voltage arrives without a current, so the filter does not use it.
         let step = CellStep { unmeasured_s, current_a: None, ..truth.step(&model, 1.0, 1.0) };
         estimator.step(&model, &config, &step);
         soc(&estimator).std()
@@ -391,7 +389,7 @@ fn two_and_three_branches_estimate_the_soc() {
         let mut truth = truth();
         for _ in 0..600 {
             let mut step = truth.step(&model, 1.0, 1.0);
-            step.voltage_v -= truth.branch_v * f64::from(branches - 1); // equal branches in the cell too
+            step.voltage_v -= truth.branch_v * f64::from(branches - 1); // the cell's branches are equal, too
             estimator.step(&model, &config, &step);
         }
         assert!((soc(&estimator).mean - truth.soc).abs() < 0.02, "{branches} branches");
@@ -427,6 +425,5 @@ fn aged_cell_starts_on_aged_curve() {
     let step = truth.step(&model, 0.0, 1.0);
     estimator.step(&model, &config, &step);
     let soc = estimator.soc().expect("started").mean;
-    // The new cell's curve would give 0.45.
     assert!((soc - 0.4).abs() < 0.005, "{soc}");
 }

@@ -1,19 +1,19 @@
-//! Determines how far a constant error of the voltage may have moved the SOC.
+//! Computes how far a constant error of the voltage may have moved the SOC.
 //!
-//! In: a cell model and the standard deviation of a constant voltage error (V). Out: the reach, which is the standard
-//! deviation of the SOC that this error causes, fraction.
+//! In: a cell model and the standard deviation of the voltage error (V). Out: the reach, which is the standard
+//! deviation of the SOC (fraction) that this error causes.
 //!
-//! The filter linearises the open-circuit curve at its estimate. Next to a flat part of the curve, this hides how wrong
-//! the SOC may be: at the upper end of an LFP cell, an error of one standard deviation moves the SOC by 1 %, and an
-//! error of four standard deviations moves it by 25 %. The reach is therefore measured at [`FAR`] standard deviations
-//! and divided by [`FAR`].
+//! The filter linearises the open-circuit curve at its estimate. Near a flat part of the curve, this understates the
+//! error of the SOC. At the upper end of an LFP cell, for example, an error of one standard deviation moves the SOC by
+//! 1 %, but an error of four standard deviations moves it by 25 %. The reach is therefore measured at [`FAR`] standard
+//! deviations and divided by [`FAR`].
 //!
-//! The filter may have found the SOC at the steep end and counted charge since. The reach of SOCs up to [`NEAR`] away
-//! therefore counts too, if a flat part of the curve is within reach there. Further away, this error is ignored.
+//! The filter may have found the SOC at the steep end and then counted charge. The reach of SOCs up to [`NEAR`]
+//! intervals away therefore counts, too, if a flat part of the curve is within reach there.
 //!
-//! If a reading contradicts the estimate next to a flat part, the reach extends from the estimate to the SOC that this
-//! reading shows with a further error of [`FAR`] standard deviations. A filter whose variance is already small corrects
-//! such a contradiction only slowly.
+//! If a reading near a flat part contradicts the estimate, the reach extends to the SOC that this reading shows with a
+//! further error of [`FAR`] standard deviations. Reason: a filter with a small variance corrects the contradiction only
+//! slowly.
 
 use crate::cell::CellModel;
 use crate::cell::model::TemperaturePosition;
@@ -21,14 +21,13 @@ use crate::cell::model::TemperaturePosition;
 /// Distance at which the reach is measured, in standard deviations of the voltage error.
 pub(super) const FAR: f64 = 4.0;
 
-/// Number of intervals of the SOC grid.
 const INTERVALS: usize = 100;
 
-/// Number of intervals up to which a place of the curve is near the present SOC.
+/// Number of grid intervals up to which the reach of another SOC counts.
 const NEAR: usize = 20;
 
-/// If a voltage error moves the SOC more than this many times as far as the slope of the curve says, a flat part of the
-/// curve is within reach.
+/// A flat part of the curve is within reach if a voltage error moves the SOC more than this many times as far as the
+/// slope of the curve says.
 pub(super) const FLAT: f64 = 2.0;
 
 /// Smallest slope of a curve (V per unit of SOC). Limits the reach where the extrapolated curve is flat.
@@ -37,9 +36,9 @@ const LEAST_SLOPE_V: f64 = 1e-3;
 /// Temperature at which the curve is evaluated (degrees C). The curve hardly depends on the temperature.
 const TEMPERATURE_C: f64 = 25.0;
 
-/// Standard deviation of a SOC found from a voltage (fraction). `soc`: the SOC. `error_v`: standard deviation of the
-/// voltage (V). `capacity_ah`: capacity that selects the curve (Ah). On a flat part of the curve, the slope at one SOC
-/// says little, so the reach of [`FAR`] standard deviations counts, too.
+/// Standard deviation (fraction) of a SOC that was found from a voltage. `soc`: the SOC. `error_v`: standard deviation
+/// of the voltage (V). `capacity_ah`: capacity that selects the curve (Ah). On a flat part of the curve, the slope at
+/// one SOC is not enough, so the reach of [`FAR`] standard deviations counts, too.
 pub fn reach_of_error(
     model: &CellModel,
     temperature: &TemperaturePosition,
@@ -53,24 +52,22 @@ pub fn reach_of_error(
     far.into_iter().map(|far| (far - soc).abs() / FAR).fold(by_slope, f64::max)
 }
 
-/// Reach on a grid of SOC.
+/// Reach over a grid of SOCs.
 #[derive(Debug, Clone)]
 pub(super) struct VoltageReach {
-    /// Per SOC: the reach (standard deviation of the SOC, fraction), and the slope of the curve divided by the voltage
-    /// error (1/fraction). The filter's linear effect times the second value is the share of the reach that counts.
+    /// Per SOC: the reach (fraction), and the slope of the curve divided by the voltage error (1/fraction). The second
+    /// value times the filter's linear effect is the share of the reach that counts.
     nodes: Vec<(f64, f64)>,
-    /// Whether a flat part of the curve is within reach of any node.
     has_flat: bool,
-    /// Open-circuit voltage per SOC (V), not falling.
+    /// Open-circuit voltage per SOC (V), never falling.
     ocv_v: Vec<f64>,
-    /// [`FAR`] standard deviations of the voltage error (V).
     far_v: f64,
-    /// Innovation above which a reading widens the reach (V): one standard deviation of noise and voltage error.
+    /// Innovation (V) above which a reading widens the reach: one standard deviation of noise and voltage error.
     usual_v: f64,
 }
 
 impl VoltageReach {
-    /// Measures the reach of an error with the standard deviation `std_v` (V). `noise_v`: noise of a reading (V).
+    /// `std_v`: standard deviation of the constant voltage error (V). `noise_v`: noise of a reading (V).
     pub(super) fn new(model: &CellModel, std_v: f64, noise_v: f64) -> Self {
         let temperature = model.temperature_position(TEMPERATURE_C);
         let ocv_v = |soc: f64| model.aged_ocv_v(&model.grid_position_at(&temperature, soc), model.capacity_ah);
@@ -92,9 +89,9 @@ impl VoltageReach {
         Self { nodes, has_flat, ocv_v, far_v: FAR * std_v, usual_v: std_v.hypot(noise_v) }
     }
 
-    /// Standard deviation of the SOC caused by the voltage error, fraction. `linear`: change of the SOC per standard
-    /// deviation of the error, as the filter has linearised it. The reach at a SOC counts only to the extent that the
-    /// filter found the SOC from the voltage there, and not by counting charge. `innovation_v`: last innovation (V).
+    /// Standard deviation of the SOC (fraction) caused by the voltage error. `linear`: change of the SOC per standard
+    /// deviation of the error, as linearised by the filter. `innovation_v`: last innovation (V). The reach counts only
+    /// as far as the filter has found the SOC from the voltage and not by counting charge.
     #[inline]
     pub(super) fn std(&self, soc: f64, linear: f64, innovation_v: f64) -> f64 {
         let (at, linear) = (soc.clamp(0.0, 1.0) * INTERVALS as f64, linear.abs());
@@ -119,7 +116,7 @@ impl VoltageReach {
         std
     }
 
-    /// Reach from the grid position `at` if the voltage error is `error_v`.
+    /// Reach from the grid position `at` for a voltage error of `error_v`.
     fn contradicted(&self, at: f64, error_v: f64) -> f64 {
         let left = (at as usize).min(INTERVALS - 1);
         let ocv_v = self.ocv_v[left] + (at - left as f64) * (self.ocv_v[left + 1] - self.ocv_v[left]);
@@ -131,7 +128,6 @@ impl VoltageReach {
     }
 }
 
-/// Whether a flat part of the curve is within reach of a node.
 fn is_flat(&(reach, per_linear): &(f64, f64)) -> bool {
     reach * per_linear > FLAT
 }
@@ -141,7 +137,7 @@ mod tests {
     use super::*;
     use crate::cell::model::tests::small_model;
 
-    /// Slopes (V): 1.5 up to 10 %, 0.0125 up to 90 %, 0.5 up to 96 %, then 3.
+    /// Slopes of the curve (V per unit of SOC): 1.5 up to 10 %, 0.0125 up to 90 %, 0.5 up to 96 %, then 3.
     fn flat_model() -> CellModel {
         let mut model = small_model();
         model.soc = vec![0.0, 0.1, 0.9, 0.96, 1.0];
@@ -169,11 +165,11 @@ mod tests {
     #[test]
     fn flat_part_near_steep_end_widens_soc() {
         let reach = VoltageReach::new(&flat_model(), 0.01, 0.0);
-        // From 92 %, four standard deviations down are 40 mV: 10 mV to 90 %, 10 mV to 10 %, and 20 mV below.
+        // Four standard deviations are 40 mV. From 92 %, 10 mV lead down to 90 %, 10 mV more to 10 %, and 20 mV below.
         let (linear, far) = (0.01 / 0.5, (0.92 - 0.1 + 0.02 / 1.5) / FAR);
         let at_end = reach.std(0.92, linear, 0.0);
         assert!((at_end - far).abs() < 0.01, "{at_end} {far}");
-        // The charge counted since does not make the SOC more certain.
+        // Counting charge does not make the SOC more certain.
         assert!(reach.std(0.8, linear, 0.0) >= 0.9 * at_end);
         assert!(reach.std(0.6, linear, 0.0) < 0.2 * at_end, "limit: beyond [`NEAR`], the error is ignored");
     }
@@ -184,10 +180,10 @@ mod tests {
         let (soc, linear) = (0.99, 0.004 / 3.0);
         let usual = reach.std(soc, linear, 0.0);
         assert_eq!(reach.std(soc, linear, -0.005), usual, "usual noise");
-        // The reading shows 90 %, and 16 mV less are below the flat part.
+        // The reading shows 90 %. An error of 16 mV more leads below the flat part.
         let wide = reach.std(soc, linear, -0.12);
         assert!(wide > 0.2 && wide > 5.0 * usual, "{wide} {usual}");
-        // After counted charge, the reading's offset says little.
+        // If the SOC comes from counted charge, the voltage error hardly matters.
         assert!(reach.std(soc, 1e-5, -0.12) < 0.01);
     }
 }

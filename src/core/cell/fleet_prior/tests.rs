@@ -1,4 +1,4 @@
-//! Tests what a prior keeps of the label, and what it takes from the vehicles.
+//! Tests which properties a prior takes from the label and which from the vehicles.
 
 use super::*;
 use crate::cell::Chemistry;
@@ -8,7 +8,7 @@ fn label() -> Label {
     Label::usual(Chemistry::Nmc811Graphite, 5.0)
 }
 
-/// The model of a vehicle whose data said nothing.
+/// The model of a vehicle that has not learned anything.
 fn untaught() -> OwnModel {
     let prior = label().prior().unwrap();
     let (modes_v, rest_v) = prior.curve.modes_v();
@@ -25,11 +25,11 @@ fn untaught() -> OwnModel {
     }
 }
 
-/// Models of vehicles with well-known cells. Curve, resistance and capacity differ by these standard deviations (V,
-/// ln, Ah) from a cell that differs from the label.
+/// Models of vehicles whose cells are well known. The mean cell differs from the label. Around the mean cell, curve,
+/// resistance and capacity have these standard deviations (V, ln, Ah).
 fn taught(count: u32, [curve_v, log_resistance, capacity_ah]: [f64; 3]) -> Vec<OwnModel> {
     let vehicle = |k: u32| {
-        // Each property has another order of the vehicles; the values are evenly spread with a variance of 1.
+        // Each property orders the vehicles differently. Its values are evenly spread with a variance of 1.
         let place = |step: u32| (f64::from(k * step % count) + 0.5) / f64::from(count) - 0.5;
         let [a, b, c] = [1, 3, 7].map(|step| 12_f64.sqrt() * place(step));
         let mut own = untaught();

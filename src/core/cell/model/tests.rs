@@ -1,8 +1,7 @@
-//! Tests tables, curves and the grid. Defines a small model that the tests of other files use.
+//! Tests the tables, curves and grid of a cell model, and defines a small model for the tests of other files.
 
 use super::*;
 
-/// A small two-temperature, one-branch cell for tests.
 pub(crate) fn small_model() -> CellModel {
     let table = |rows: [[f64; 3]; 2]| Table { values: rows.iter().map(|r| r.to_vec()).collect() };
     CellModel {
@@ -45,7 +44,7 @@ fn resistances_follow_arrhenius_and_time_constants_stay() {
     for t_c in [0.0, 7.0, 20.0, 33.0, 40.0] {
         assert!((at(t_c) / at(0.0) - arrhenius(t_c) / arrhenius(0.0)).abs() < 1e-12, "{t_c}");
     }
-    // Nodes with the same time constant but different resistances.
+    // All nodes get the same time constant with different resistances.
     for (t, s) in [(0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2)] {
         model.branches[0].c_farad.values[t][s] = 30.0 / model.branches[0].r_ohm.values[t][s];
     }
@@ -76,7 +75,7 @@ fn aged_voltage_agrees_with_slope_and_inverse() {
     model.aged_ocv = AgedOcv::of_shift(0.8, &model.soc, model.capacity_ah, &[vec![3.0, 3.5, 4.0]]);
     let temperature = model.temperature_position(17.0);
     let at = |soc: f64| model.aged_ocv_v(&model.grid_position_at(&temperature, soc), 1.5);
-    // A loss of a quarter of the capacity moves the middle by 0.8 x 0.25 x 0.25 of SOC.
+    // The loss of a quarter of the capacity moves the middle of the curve by 0.8 x 0.25 x 0.25 of SOC.
     let new_v = model.ocv_v(&model.grid_position(0.5, 17.0));
     assert!((at(0.5) - new_v - 0.05).abs() < 1e-12);
     for soc in [-0.1, 0.1, 0.45, 0.7, 1.05] {

@@ -1,25 +1,25 @@
-//! Finds the measurements that reduce a cell model's SOC error the most, from the standard deviations of the model.
+//! Finds the measurements that reduce a cell model's SOC error the most.
 //!
-//! In: [`ModelBands`]. Out: up to [`MOST`] measurements, the most useful first. Each measurement is returned with the
-//! error that remains after it and all measurements before it.
+//! In: [`ModelBands`]. Out: up to [`MOST`] measurements, the most useful first. Each measurement has the error that
+//! remains after it and all measurements before it.
 //!
 //! The expected error is the root mean square error of the SOC, averaged over SOC and over the temperatures of
-//! [`USE_C`]. The SOC is estimated from two sources: one voltage under a usual load, and the charge counted since the
-//! last reliable voltage. The capacity that converts this charge to SOC is uncertain. A measurement is an observation
-//! of the curve, of ln(resistance) or of the capacity. Covariances fall with the distance in SOC and temperature, so a
-//! measurement also gives information about neighbouring points: their variance p becomes p - c^2 / (v + r) (Gaussian
-//! conditioning). Here c is the covariance with the observed point, v is the variance at the observed point, and r is
-//! the error variance of the observation.
+//! [`USE_C`]. The SOC comes from one voltage under a usual load and from the charge counted since the last reliable
+//! voltage. The capacity, which converts this charge to SOC, is uncertain.
+//!
+//! A measurement observes the curve, ln(resistance) or the capacity. Covariances fall with the distance in SOC and
+//! temperature, so a measurement also improves neighbouring points. Their variance p becomes p - c^2 / (v + r)
+//! (Gaussian conditioning). c is the covariance with the observed point, v is the variance at the observed point, and r
+//! is the error variance of the observation.
 
 use std::fmt;
 
 use super::{ModelBands, ResistanceBand, soc_variance};
 use crate::filter::{bell, square};
 
-/// Maximum number of measurements.
 const MOST: usize = 3;
 
-/// Temperatures of use (degrees C) with their weights: a car outdoors in a temperate climate.
+/// Temperatures of use (degrees C) with their weights, for a car outdoors in a temperate climate.
 const USE_C: [(f64, f64); 4] = [(-7.0, 0.15), (3.0, 0.25), (20.0, 0.4), (35.0, 0.2)];
 /// SOC values over which the errors are averaged.
 const USE_SOC: [f64; 10] = [0.05, 0.15, 0.25, 0.35, 0.45, 0.55, 0.65, 0.75, 0.85, 0.95];
@@ -41,7 +41,7 @@ impl fmt::Display for Measurement {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Rest(soc) => write!(f, "one rest of an hour near {:.0} %", 100.0 * soc),
-            // A cold drive may take place at lower temperatures, or at up to 2 K more.
+            // A cold drive may be up to 2 K warmer, or colder by any amount.
             Self::Drive(temperature_c) if *temperature_c < 10.0 => {
                 write!(f, "a drive below {:.0} \u{b0}C", temperature_c + 2.0)
             }
@@ -56,11 +56,11 @@ impl fmt::Display for Measurement {
 pub struct Advice {
     /// The measurement.
     pub measurement: Measurement,
-    /// Expected SOC error after this measurement and all measurements before it in the list, percentage points.
+    /// Expected SOC error (percentage points) after this measurement and all measurements before it in the list.
     pub left_points: f64,
 }
 
-/// Expected SOC error with the model, in percentage points, and the measurements that reduce it. `None` if the model
+/// Expected SOC error with the model (percentage points), and the measurements that reduce it. `None` if the model
 /// states no error. The list is empty if no measurement helps much.
 pub fn advise(bands: &ModelBands<'_>) -> Option<(f64, Vec<Advice>)> {
     let mut belief = Belief::of(bands)?;
@@ -84,20 +84,17 @@ pub fn advise(bands: &ModelBands<'_>) -> Option<(f64, Vec<Advice>)> {
     Some((first_points, advice))
 }
 
-/// Present knowledge about a model: slopes, voltage drops and covariances at the points of use and at the points that
-/// can be measured.
+/// Present knowledge about a model at the points of use and at the points that can be measured.
 #[derive(Clone)]
 struct Belief {
-    /// Slope of the curve (V per unit of SOC): `slope_v` at [`USE_SOC`], `rest_slope_v` at [`REST_SOC`].
+    /// Slope of the curve (V per unit of SOC) at [`USE_SOC`], and at [`REST_SOC`].
     slope_v: Vec<f64>,
     rest_slope_v: Vec<f64>,
-    /// Covariance (V^2) of the curve over [`USE_SOC`] and then [`REST_SOC`].
+    /// Covariance of the curve (V^2) over [`USE_SOC`] and then [`REST_SOC`].
     curve: Vec<Vec<f64>>,
-    /// Voltage drop (V) of a usual load, by temperature of [`USE_C`] and SOC of [`USE_SOC`].
+    /// Voltage drop of a usual load (V), by temperature of [`USE_C`] and SOC of [`USE_SOC`].
     drop_v: Vec<Vec<f64>>,
-    /// Covariance of ln(resistance) between temperatures of [`USE_C`], at each SOC of [`USE_SOC`].
     resistance: Vec<Vec<Vec<f64>>>,
-    /// Standard deviation of the capacity, fraction.
     capacity_std: f64,
 }
 
@@ -108,7 +105,7 @@ impl Belief {
         let modes_v: Vec<[f64; 2]> = places.iter().map(|&soc| bands.modes_v(soc)).collect();
         let covariance = |i: usize, k: usize| {
             let modes: f64 = modes_v[i].iter().zip(modes_v[k]).map(|(a, b)| a * b).sum();
-            // Correlation lengths: 15 % of SOC for the curve, 20 K for resistances.
+            // The correlation lengths are 15 % of SOC for the curve and 20 K for resistances.
             modes + rest_v[i] * rest_v[k] * bell((places[i] - places[k]) / 0.15)
         };
         let all = 0..places.len();
@@ -131,10 +128,9 @@ impl Belief {
         })
     }
 
-    /// Expected error of the SOC (points).
     fn points(&self) -> f64 {
-        // Assumes that half of the capacity has been moved since the last reliable voltage. Even with the right
-        // capacity, the counted SOC has an error of 6 %, because of its initial value and the current sensor.
+        // Half of the capacity is assumed to have moved since the last reliable voltage. Even with the right capacity,
+        // the counted SOC has an error of 6 %, because of its initial value and the current sensor.
         let counted = square(0.06) + square(0.5 * self.capacity_std);
         let at = |t: usize, s: usize| {
             let of_drop = self.resistance[s][t][t] * square(self.drop_v[t][s]);
@@ -145,21 +141,20 @@ impl Belief {
         100.0 * variance.sqrt()
     }
 
-    /// The knowledge after a measurement.
     fn after(&self, measurement: &Measurement) -> Self {
         let mut after = self.clone();
         match measurement {
             Measurement::Rest(soc) => {
                 let place = REST_SOC.iter().position(|known| known == soc).unwrap_or(0);
-                // Two errors: of the voltage after an hour of rest, and of the SOC, which was counted since another
-                // rest.
+                // The voltage after an hour of rest has an error. The SOC has an error because it was counted since
+                // another rest.
                 let noise_v = f64::hypot(0.005, 0.02 * self.rest_slope_v[place]);
                 condition(&mut after.curve, USE_SOC.len() + place, square(noise_v));
             }
             Measurement::Drive(temperature_c) => {
                 let place = USE_C.iter().position(|(known, _)| known == temperature_c).unwrap_or(0);
-                // After a drive, the resistance is known to 10 %; after a charge from below 20 % to full, the capacity
-                // is known to 2 %.
+                // A drive determines the resistance to 10 %. A charge from below 20 % to full determines the capacity
+                // to 2 %.
                 after.resistance.iter_mut().for_each(|of_soc| condition(of_soc, place, square(0.1)));
             }
             Measurement::Charge => after.capacity_std = self.capacity_std.min(0.02),
@@ -168,7 +163,7 @@ impl Belief {
     }
 }
 
-/// Updates a covariance for an observation of element `at` with this variance.
+/// Updates a covariance with an observation of element `at` that has this error variance.
 fn condition(covariance: &mut [Vec<f64>], at: usize, variance: f64) {
     let column: Vec<f64> = covariance.iter().map(|row| row[at]).collect();
     let total = column[at] + variance;

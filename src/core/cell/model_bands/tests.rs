@@ -1,5 +1,4 @@
-//! Tests the uncertainty bands of models from labels and of a model that states no error. Also tests the advice on
-//! measurements that is derived from the bands.
+//! Tests the uncertainty bands of models from labels and of a model without a stated error. Also tests the advice.
 
 use super::*;
 use crate::cell::model::tests::small_model;
@@ -38,7 +37,7 @@ fn model_without_error_has_no_band() {
     let bands = ModelBands::new(&model);
     assert_eq!((bands.curve_std_v(0.5), bands.rest_soc_std(0.5), bands.load_soc_std(0.5, 20.0)), (None, None, None));
     assert_eq!(advise(&bands), None);
-    // Without a stated error, the model has the spread of cells of one type.
+    // Without a stated error, the usual differences within one cell type apply.
     assert_eq!((bands.resistance(0.5, 20.0).std(), bands.capacity_std()), (0.2, 0.1));
 }
 
@@ -48,7 +47,7 @@ fn cold_error_counts_as_resistance_error() {
     let model = CellModel { voltage_error_v: Some(Table { values: errors }), ..small_model() };
     let bands = ModelBands::new(&model);
     assert!(bands.curve_std_v(0.5).is_some_and(|v| (v - 0.005).abs() < 1e-12));
-    // At 0 degrees C, a load of C/2 (1 A) through 0.08 ohm drops 80 mV.
+    // A load of C/2 (1 A) through 0.08 ohm at 0 degrees C drops 80 mV.
     let cold = bands.resistance(0.5, 0.0);
     assert!((cold.local - (0.03_f64.powi(2) - 0.005_f64.powi(2)).sqrt() / 0.08).abs() < 1e-12, "{cold:?}");
     let warm = bands.resistance(0.5, 40.0);

@@ -1,18 +1,21 @@
 //! Fits a model to the rows of a notebook over a grid of capacities.
 //!
-//! In: a [`Label`] and rows (readings of the mean cell, averaged over a short time). Out: a [`Fit`]. For each capacity
-//! C of the grid, damped Gauss-Newton steps find the most likely values of the other parameters (maximum a posteriori).
-//! These parameters are the open-circuit curve at the SOC breakpoints and its fall in the cold, the resistances
-//! relative to the label's model over SOC and by temperature, the offset of the current sensor, and the SOC s_k at the
-//! start of each stretch (a period with a continuously measured current). After the charge q, corrected for the offset,
-//! SOC = s_k - q / C. The density of a capacity is the density of its best fit times the volume of the other parameters
-//! around this fit (Laplace). If the rows allow two capacities, the density has two maxima.
+//! In: a [`Label`] and rows (readings of the mean cell, averaged over a short time). Out: a [`Fit`].
+//!
+//! For each capacity C of the grid, damped Gauss-Newton steps find the most likely values of the other parameters
+//! (maximum a posteriori). The curve has parameters for its voltages and for its sag in the cold. The resistances are
+//! relative to the label's model and have parameters over SOC and temperature. The last parameters are the offset of
+//! the current sensor, and the SOC s_k at the start of each stretch (a period with a continuously measured current).
+//! After the charge q, corrected for the offset, SOC = s_k - q / C.
+//!
+//! The density of a capacity is the density of its best fit times the volume of the other parameters around this fit
+//! (Laplace). If the rows allow two capacities, the density has two maxima.
 //!
 //! # Errors of a row
-//! The errors of the circuit model repeat: rows at nearly the same SOC have the same errors of voltage, SOC and voltage
-//! drop. The errors of rows are therefore correlated over 12 % of SOC. The error of a row has three parts: a constant,
-//! a part proportional to the slope of the curve, and a part that grows with the voltage drop. The third part grows
-//! faster than the drop, because charge transfer is not linear (Butler-Volmer).
+//! Rows at nearly the same SOC have the same errors of voltage, SOC and voltage drop, so their errors are correlated
+//! over 12 % of SOC. The error of a row has three parts: a constant, a part proportional to the slope of the curve, and
+//! a part that grows with the voltage drop. The third part grows faster than the drop, because charge transfer is not
+//! linear (Butler-Volmer).
 //!
 //! The constants were chosen with three cells at 25 degrees C: LG HG2, LG M50 (simulated) and a Leaf cell.
 
@@ -31,17 +34,16 @@ use crate::filter::levenberg_marquardt::{Damping, minimise};
 use basis::{BEGINNINGS, BY_TEMPERATURE, Basis, COLD_SAG, FACTORS, LOG_CAPACITY, OFFSET};
 use noise::{NormalEquations, RepeatedErrors};
 
-/// Damping of the search for the most likely parameters.
 const DAMPING: Damping =
     Damping { first: 1e-3, fall: 0.2, fall_after_growth: 0.2, growth: 8.0, least: 1e-9, most: 8e6 };
-/// Step of the capacity grid, relative to the rated capacity. The grid starts at 0.52 and has `CAPACITIES` points. The
-/// search starts at the point `FIRST_CAPACITY`, which is the rated capacity.
+/// Step of the capacity grid, relative to the rated capacity. The grid has `CAPACITIES` points from 0.52 on. The point
+/// `FIRST_CAPACITY`, where the search starts, is the rated capacity.
 const CAPACITY_STEP: f64 = 0.04;
 const CAPACITIES: usize = 20;
 const FIRST_CAPACITY: usize = 12;
-/// In each direction, the search over the capacities ends if the cost exceeds the lowest cost by more than this.
+/// The search in one direction ends if the cost exceeds the lowest cost by more than this.
 const HOPELESS: f64 = 25.0;
-/// Number of points per step of the capacity grid. The density is evaluated at these points.
+/// Number of points per step of the capacity grid at which the density is evaluated.
 const FINE: usize = 20;
 
 /// A fit.
@@ -49,27 +51,27 @@ const FINE: usize = 20;
 pub struct Fit {
     /// The model.
     pub own: OwnModel,
-    /// Root mean square of the rows' residuals, in standard deviations. This value is about 1 if the cells have the
-    /// label's chemistry and the errors of the circuit model are as assumed.
+    /// Root mean square of the rows' residuals, in standard deviations. It is about 1 if the cells have the label's
+    /// chemistry and the assumed errors of the circuit model are right.
     pub misfit: f64,
     /// Start of the last stretch; `None` without rows.
     beginning: Option<Beginning>,
 }
 
-/// Start of a stretch. The SOC after a charge q and a time t is soc - (q - t offset) / capacity.
+/// Start of a stretch. After the charge q and the time t, the SOC is soc - (q - t offset) / capacity.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Beginning {
     stretch: u32,
-    /// SOC at the start, and offset of the current sensor (A). `covariance` is their covariance at the fitted capacity.
+    /// SOC at the start, and offset of the current sensor (A). `covariance` applies at the fitted capacity.
     means: [f64; 2],
     covariance: [[f64; 2]; 2],
-    /// Change of each mean if the capacity grows by one standard deviation.
+    /// Change of each mean per standard deviation of the capacity.
     by_capacity: [f64; 2],
 }
 
 impl Fit {
-    /// Present SOC (fraction), and covariance of the SOC with the capacity (Ah); `None` outside a stretch and while the
-    /// present stretch has no rows.
+    /// Present SOC (fraction), and covariance of the SOC with the capacity (Ah). `None` outside a stretch, and while
+    /// the present stretch has no rows.
     pub fn soc(&self, present: Option<PresentStretch>) -> Option<(ScalarGaussian, f64)> {
         let (present, beginning) = present.zip(self.beginning)?;
         let Beginning { stretch, means, covariance, by_capacity } = beginning;
@@ -87,7 +89,6 @@ impl Fit {
     }
 }
 
-/// The most likely parameters at one capacity.
 #[derive(Debug, Clone)]
 struct Conditional {
     theta: DVector<f64>,
@@ -95,15 +96,12 @@ struct Conditional {
     normal: DMatrix<f64>,
     /// Minus the logarithm of the capacity's density, up to a constant that depends only on the prior.
     cost: f64,
-    /// Root mean square of the rows' residuals in standard deviations.
     misfit: f64,
 }
 
-/// Search for the parameters that fit the model of one label to rows.
 struct Search<'a> {
     basis: Basis<'a>,
     prior: DMatrix<f64>,
-    /// Means of the prior.
     expected: DVector<f64>,
     rated_ah: f64,
 }
@@ -113,7 +111,7 @@ pub fn says_enough(label: &Label, rows: &[Row]) -> bool {
     rows.len() >= 12 && span_ah(rows) >= 0.15 * label.rated_ah
 }
 
-/// Fits a model. `None` if the rows contain too little information, or if the fitted capacity is far from the label's
+/// Fits a model. Returns `None` if the rows contain too little information, or if the capacity is far from the label's
 /// capacity.
 pub fn fit(prior: &LabelPrior, rows: &[Row]) -> Option<Fit> {
     if !says_enough(&prior.label, rows) {
@@ -124,16 +122,16 @@ pub fn fit(prior: &LabelPrior, rows: &[Row]) -> Option<Fit> {
     search.finish(capacity, &start)
 }
 
-/// Minus the logarithm of the rows' probability with a label, minimised over `capacities_ah` (Ah). The results of
-/// different labels can be compared.
+/// Minus the logarithm of the rows' probability with a label, minimised over `capacities_ah` (Ah). Values of different
+/// labels can be compared.
 pub fn label_cost(prior: &LabelPrior, rows: &[Row], capacities_ah: &[f64]) -> Option<f64> {
     let (search, start) = Search::new(prior, rows)?;
     let costs = capacities_ah.iter().filter_map(|&ah| search.conditional(ah, &start).map(|found| found.cost));
     Some(costs.min_by(f64::total_cmp)? - 0.5 * prior::log_determinant(&search.prior)?)
 }
 
-/// Cost of rows: minus the logarithm of the probability density that a model (`own`; `None` = the label's model) gives
-/// the rows. Each stretch starts at its most likely SOC. Returns `None` without rows.
+/// Cost of rows: minus the logarithm of the probability density that the model `own` gives the rows (`None` = the
+/// label's model). Each stretch starts at its most likely SOC. Returns `None` without rows.
 pub(super) fn rows_cost(prior: &LabelPrior, own: Option<&OwnModel>, rows: &[Row]) -> Option<f64> {
     let basis = Basis::new(prior, rows);
     let theta = basis.parameters(own);
@@ -144,7 +142,6 @@ pub(super) fn rows_cost(prior: &LabelPrior, own: Option<&OwnModel>, rows: &[Row]
     (!rows.is_empty()).then_some(sums.cost)
 }
 
-/// Largest charge range of a stretch (Ah).
 fn span_ah(rows: &[Row]) -> f64 {
     let of_stretch = |rows: &[Row]| {
         let charges = rows.iter().map(|row| f64::from(row.charge_ah));
@@ -155,7 +152,6 @@ fn span_ah(rows: &[Row]) -> f64 {
 }
 
 impl<'a> Search<'a> {
-    /// Creates a search with its initial parameters.
     fn new(prior: &'a LabelPrior, rows: &'a [Row]) -> Option<(Self, DVector<f64>)> {
         let rated_ah = prior.label.rated_ah;
         let basis = Basis::new(prior, rows);
@@ -166,8 +162,8 @@ impl<'a> Search<'a> {
         Some((Self { basis, prior, expected, rated_ah }, start))
     }
 
-    /// Normal equations of the rows and the prior at `theta`. The capacity's gradient is set to 0, so that a step keeps
-    /// the capacity.
+    /// Normal equations of rows and prior at `theta`. The capacity's gradient is set to 0, so that a step keeps the
+    /// capacity.
     fn sums(&self, theta: &DVector<f64>, errors: &RepeatedErrors) -> Option<NormalEquations> {
         let off = theta - &self.expected;
         let gradient = &self.prior * &off;
@@ -181,8 +177,7 @@ impl<'a> Search<'a> {
         sums.cost.is_finite().then_some(sums)
     }
 
-    /// The most likely values of the other parameters at a capacity (Ah). The search starts from `start`
-    /// (Levenberg-Marquardt).
+    /// The most likely values of the other parameters at a capacity (Ah), searched from `start` (Levenberg-Marquardt).
     fn conditional(&self, capacity_ah: f64, start: &DVector<f64>) -> Option<Conditional> {
         self.conditional_with(&RepeatedErrors::USUAL, capacity_ah, start)
     }
@@ -206,7 +201,7 @@ impl<'a> Search<'a> {
         Some(Conditional { theta, normal: sums.normal, cost, misfit })
     }
 
-    /// Mean and variance of the capacity's density (Ah). `None` if the capacity does not fit this label.
+    /// Mean and variance of the capacity (Ah). `None` if the capacity does not fit this label.
     fn capacity(&self, start: &DVector<f64>) -> Option<ScalarGaussian> {
         let at = |k: usize| self.rated_ah * (0.52 + CAPACITY_STEP * k as f64);
         let mut found: Vec<Option<f64>> = vec![None; CAPACITIES];
@@ -236,18 +231,17 @@ impl<'a> Search<'a> {
         let (mean, variance) = moments(&costs, least);
         let step_ah = CAPACITY_STEP * self.rated_ah;
         let capacity_ah = at(first) + step_ah * mean;
-        // Add errors that the fit cannot detect, such as the gain and the offset of the current sensor.
+        // Adds errors that the fit cannot detect, such as the gain and the offset of the current sensor.
         let std_ah = (1.4 * step_ah * variance.sqrt()).hypot(0.015 * capacity_ah);
         Some(ScalarGaussian::from_std(capacity_ah, std_ah))
     }
 
-    /// Computes the model and the start of the last stretch at the fitted `capacity`, with their standard deviations.
     fn finish(&self, capacity: ScalarGaussian, start: &DVector<f64>) -> Option<Fit> {
         let Conditional { theta, normal, misfit, .. } = self.conditional(capacity.mean, start)?;
         let std_ah = capacity.std();
         let [low, high] = [-0.5, 0.5].map(|part| self.conditional(capacity.mean + part * std_ah, &theta));
-        // Change of each parameter per standard deviation of the capacity. The capacity's entry is the change of its
-        // logarithm.
+        // Change of each parameter per standard deviation of the capacity. The entry of the capacity is the change of
+        // its logarithm.
         let by_capacity = high?.theta - low?.theta;
         let theta = self.conditional_with(&RepeatedErrors::IN_TABLES, capacity.mean, &theta)?.theta;
         let mut covariance = normal.cholesky()?.inverse();
@@ -297,8 +291,8 @@ impl<'a> Search<'a> {
     }
 }
 
-/// Mean and variance of the density exp(least - cost), in steps of the grid. `costs`: cost at each point of the grid;
-/// cubics (Catmull-Rom) interpolate between the points.
+/// Mean and variance, in steps of the grid, of the density exp(least - cost). `costs` has one cost per point of the
+/// grid; cubics (Catmull-Rom) interpolate between the points.
 fn moments(costs: &[f64], least: f64) -> (f64, f64) {
     let last = costs.len() - 1;
     let slope = |k: usize| {

@@ -1,8 +1,8 @@
 //! Describes a fit of the pack's own cell model as a task with inputs and a result.
 //!
-//! A fit takes hundreds of times longer than a tick of the monitor may take, and the result depends only on the inputs.
-//! A live host therefore runs the task on a separate thread. A replay runs the task on the calling thread, with the
-//! same result.
+//! A fit takes hundreds of times longer than a tick of the monitor may take. A live host therefore runs the task on a
+//! separate thread. A replay runs it on the calling thread, with the same result, because the result depends only on
+//! the inputs.
 
 use super::fit::{self, Fit};
 use super::{OwnModel, rows_cost};
@@ -16,9 +16,9 @@ pub struct FitTask {
     label: Label,
     fleet: Option<FleetPrior>,
     rows: Vec<Row>,
-    /// Number of rows, at the end of `rows`, that no fit has used yet.
+    /// Number of rows that no fit has used yet; they are at the end of `rows`.
     new_rows: usize,
-    /// The present model (`own`) and the previous model (`before`); `None` = the label's model.
+    /// Present model (`own`) and previous model (`before`); `None` = the label's model.
     own: Option<OwnModel>,
     before: Option<OwnModel>,
 }
@@ -30,8 +30,7 @@ pub struct FitFindings {
     pub is_before_better: bool,
     /// Whether the rows suffice for a fit.
     pub is_enough: bool,
-    /// The fit to all rows. `None` if there are too few rows, or if the fitted capacity is far from the label's
-    /// capacity.
+    /// The fit to all rows; `None` if there are too few rows, or if the capacity is far from the label's capacity.
     pub fit: Option<Fit>,
     /// The chemistry that explains the rows clearly better than the label's chemistry, if any.
     pub chemistry: Option<Chemistry>,
@@ -72,17 +71,17 @@ impl FitTask {
         let new_rows = &self.rows[self.rows.len() - self.new_rows..];
         let cost = |own: Option<&OwnModel>| rows_cost(prior, own, new_rows);
         let costs = cost(Some(own)).zip(cost(self.before.as_ref()));
-        // A model whose cost is lower by 4 is about 50 times more likely.
+        // If the cost is lower by 4, the model is about 50 times more likely.
         costs.is_some_and(|(present, before)| before < present - 4.0)
     }
 
-    /// The chemistry that explains the rows clearly better than the label's chemistry, if any. Each chemistry is judged
-    /// at the fitted, rated or expected capacity, whichever gives the lowest cost.
+    /// The chemistry that explains the rows clearly better than the label's chemistry, if any. The cost of a chemistry
+    /// is the lowest of its costs at the fitted, rated and expected capacities.
     fn better_chemistry(&self, prior: &LabelPrior, fitted: Option<&Fit>) -> Option<Chemistry> {
         let Self { label, rows, .. } = self;
-        // The better chemistry must be about 50 times more likely (a margin of 4). The margin grows if the misfit
-        // exceeds 0.45, which is typical of drives that a circuit model describes well. On drives of four cells, the
-        // costs of NCA and NMC differ by 4 to 9; the cost of LFP differs from all others by hundreds.
+        // A margin of 4 means that the better chemistry is about 50 times more likely. The margin grows above a misfit
+        // of 0.45, which is typical of drives that a circuit model describes well. On drives of four cells, the costs
+        // of NCA and NMC differ by 4 to 9, and the cost of LFP differs from all others by hundreds.
         let margin = 4.0 * fitted.map_or(1.0, |it| (it.misfit / 0.45).max(1.0));
         let fitted_ah = fitted.map(|it| it.own.capacity.mean);
         let expected_ah = prior.expected.as_ref().map(|own| own.capacity.mean);

@@ -1,4 +1,5 @@
 //! Corrects the differences between the cells for balancing, if the BMS sends bits that show which cells it bleeds.
+//! To bleed a cell is to discharge it through a balancing resistor.
 
 use serde::{Deserialize, Serialize};
 
@@ -6,14 +7,14 @@ use super::{CellFaultDetector, inner_half};
 use crate::cell_faults::bleed_timer::{BalancingConfig, BleedTime, BleedTimer};
 use crate::quantity::{InvalidState, Timestamp};
 
-/// Relative standard deviation of the bled charge as computed from the bits. The balancing resistors of one BMS are
-/// equal, but the bleed current depends on the cell voltage.
+/// Relative standard deviation of the bled charge that is computed from the bits. The balancing resistors of one BMS
+/// are equal, but the bleed current depends on the cell voltage.
 const BLEED_PART: f64 = 0.2;
-/// Maximum SOC that bleeding can take from a cell relative to the other cells. There is a maximum because a BMS bleeds
-/// a cell only down to the level of the lowest cell.
+/// Maximum SOC that bleeding can take from a cell relative to the other cells. A BMS bleeds a cell only down to the
+/// level of the lowest cell.
 const MOST_BESIDE: f64 = 0.1;
 
-/// Sum of errors that have the same sign while their cause lasts. Such errors are added linearly, not as squares.
+/// Sum of errors that keep their sign while their cause lasts. Such errors are added linearly, not as squares.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct CorrelatedError {
@@ -21,8 +22,7 @@ struct CorrelatedError {
 }
 
 impl CorrelatedError {
-    /// Adds the error of one row. Returns the increase of the squared sum, which is bounded because the sum is bounded.
-    /// A row with the error 0 resets the sum.
+    /// Adds the error of one row. Returns the increase of the squared sum. A row with the error 0 resets the sum.
     fn add(&mut self, part: f64) -> f64 {
         let before = std::mem::take(&mut self.sum);
         let part = part.clamp(-MOST_BESIDE, MOST_BESIDE);
@@ -34,13 +34,12 @@ impl CorrelatedError {
     }
 }
 
-/// Balancing of one cell.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Bleed {
     pub(super) timer: BleedTimer,
-    /// SOC bled from this cell minus the SOC bled from the middle cells (the middle half by voltage), summed over all
-    /// rows since this difference was last 0.
+    /// SOC bled from this cell minus the mean SOC bled from the middle cells (the middle half by voltage). Summed
+    /// over all rows since this difference was last 0.
     bled: CorrelatedError,
     /// Maximum SOC that the cell may have lost while it was unknown whether the cell was bled.
     unseen: CorrelatedError,
@@ -52,13 +51,11 @@ impl Bleed {
         *self == Self::default()
     }
 
-    /// Discards all counted time and the errors.
     pub(super) fn forget_time(&mut self) {
         self.timer.forget_time();
         *self = Self { timer: self.timer, ..Self::default() };
     }
 
-    /// Checks the numbers of a stored state.
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         self.timer.check()?;
         InvalidState::unless_natural("the charge bled from a cell", self.bled.sum.abs())?;
@@ -85,9 +82,8 @@ impl CellFaultDetector {
         self.cells.iter_mut().for_each(|cell| cell.bleed.timer.note_missed_bits(from, to));
     }
 
-    /// Corrects the charge difference of each cell: subtracts the charge that the BMS has bled from the cell since the
-    /// last row, minus the charge bled from the middle cells. If `balancing` is `None`, discards everything learned
-    /// from balancing bits.
+    /// Subtracts from each cell the charge that the BMS has bled from it since the last row, relative to the middle
+    /// cells. If `balancing` is `None`, discards everything learned from balancing bits.
     pub(super) fn remove_bled_charge(&mut self, time: Timestamp, capacity_ah: f64, balancing: Option<BalancingConfig>) {
         let Some(balancing) = balancing else {
             return self.cells.iter_mut().for_each(|cell| cell.bleed = Bleed::default());
@@ -112,7 +108,6 @@ impl CellFaultDetector {
         }
     }
 
-    /// Mean bleed time of the cells whose voltages are in the middle half (s).
     fn bled_in_middle_s(&self, times: &[BleedTime]) -> f64 {
         let known = self.cells.iter().zip(times).filter(|(cell, _)| cell.bleed.timer.has_bits);
         let mut by_voltage: Vec<(f64, f64)> =
@@ -152,7 +147,7 @@ mod tests {
 
     #[test]
     fn time_without_bits_is_unknown_unless_configured_otherwise() {
-        // Standard deviation of the SOC lost in 8 h at 0.06 A / 60 Ah, for a uniform distribution.
+        // Standard deviation of the SOC that a 60 Ah cell loses in 8 h at 0.06 A, for a uniform distribution.
         let unknown = 0.008 / 3.0_f64.sqrt();
         let silent = BalancingConfig { is_only_while_sent: false, ..BALANCING };
         let near = |a: f64, b: f64| (a - b).abs() < 0.01 * unknown;

@@ -1,5 +1,6 @@
 //! Derives findings from the states of the cells, and decides when to report and when to withdraw a finding. The
-//! detector judges the cells at the end of a row, which holds the sums of a few minutes of samples.
+//! detector judges the cells at the end of each row (sums of a few minutes of samples). A BMS *bleeds* a cell when it
+//! discharges the cell through a balancing resistor.
 
 use super::CellFaultDetector;
 use crate::cell_faults::difference::{CAPACITY, CHANNEL, CONTACT, Jump, LEAK, RESISTANCE, SOC, STATES};
@@ -7,28 +8,27 @@ use crate::cell_faults::fault::{self, CellFault, CellFaultKind, OUTLIER, REPORTE
 use crate::filter::{ScalarGaussian, normal_cdf};
 use crate::quantity::{CellIndex, DAY_S, Timestamp};
 
-/// Neighbouring cells with a higher capacity count as one replaced module if their findings are at most this far apart,
-/// s. A single cell with a higher capacity is reported only after this time.
+/// Maximum time between the findings of neighbouring cells that count as one replaced module (s). A single cell with
+/// a higher capacity is reported only after this time.
 const SAME_MODULE_S: f64 = 3.0 * DAY_S;
-/// The size of a fault counts as known if its standard deviation is at most this multiple of the limit at which a fault
-/// of this kind is reported.
+/// Maximum standard deviation of a known fault size, as a multiple of the limit at which this kind of fault is
+/// reported.
 const KNOWN_LIMITS: f64 = 2.0;
 
-/// From this probability of a leak on, the leak explains a charge difference.
+/// If the probability of a leak is at least this, the leak explains a charge difference.
 const LIKELY: f64 = 0.9;
-/// Up to this standard deviation, a cell's capacity relative to the others is known, fraction.
+/// Maximum standard deviation of a known capacity difference, fraction.
 const KNOWN_CAPACITY_STD: f64 = 0.05;
-/// The charge of a cell is compared at these values of the SOC.
+/// SOC values at which a cell's charge is compared.
 const CHARGE_AT: [f64; 2] = [0.2, 0.9];
 
-/// Until a fault is found, its size is at most this part of the limit.
+/// Maximum size shown for a fault that is not yet a finding, as a fraction of its limit.
 const BELOW_LIMIT: f64 = 0.99;
 
-/// If a cell's SOC differs from the other cells' SOC by this much or more, its contact, its resistance, the offset of
-/// its channel and a higher capacity cannot be judged.
+/// If a cell's SOC differs from the other cells' SOC by at least this much, four faults cannot be judged: contact,
+/// resistance, channel offset and higher capacity.
 const TOO_FAR: f64 = 0.1;
 
-/// Judgement of one cell for one kind of fault.
 #[derive(Debug, Clone, Copy)]
 struct Judgement {
     kind: CellFaultKind,
@@ -104,9 +104,9 @@ impl CellFaultDetector {
         self.find_modules(time, &foreign);
     }
 
-    /// Size of each fault, per cell and kind, relative to the median of the pack and in the unit of the kind. `None` if
-    /// the size cannot be judged: the cell is not compared, the cell's SOC is too far from the other cells' SOC, the
-    /// cell's channel is faulty, or the size is still too uncertain.
+    /// Size of each fault, per cell and kind, relative to the median of the pack and in the unit of the kind. `None`
+    /// if the size cannot be judged. Possible reasons: the cell is not compared, its SOC is too far from the other
+    /// cells' SOC, its channel is faulty, or the size is still too uncertain.
     pub fn sizes<const N: usize>(&self, kinds: [CellFaultKind; N]) -> Vec<[Option<ScalarGaussian>; N]> {
         let populations = self.populations();
         (0..self.cells.len()).map(|cell| kinds.map(|kind| self.size(cell, kind, &populations))).collect()
@@ -141,9 +141,9 @@ impl CellFaultDetector {
         std::array::from_fn(|state| self.population(state))
     }
 
-    /// The cell whose channel clearly reads lowest at the SOC at which a BMS bleeds cells; `None` if no cell clearly
-    /// reads lowest. A BMS never bleeds this cell, because the BMS follows its own readings, including their errors.
-    /// The cell counts as the lowest until another cell reads lower.
+    /// Returns the cell with the clearly lowest voltage reading at the SOC at which a BMS bleeds cells. A BMS never
+    /// bleeds this cell, because it follows its own readings, including their errors. The cell stays the lowest until
+    /// another cell reads lower.
     fn clearly_lowest(&self, slope_v: f64) -> Option<usize> {
         let (mut lowest, mut next): (Option<(usize, ScalarGaussian)>, Option<ScalarGaussian>) = (None, None);
         let compared = self.cells.iter().enumerate().filter(|(_, cell)| cell.is_compared);
@@ -161,16 +161,15 @@ impl CellFaultDetector {
         (next.mean - shown.mean > 2.0 * shown.std().hypot(next.std())).then_some(lowest)
     }
 
-    /// Whether a BMS may bleed the cell without sending a bit that shows it. This applies to every cell of a balanced
-    /// pack without bits, with two exceptions: the lowest cell, and cells with a reported leak. A leaking cell loses
-    /// charge even while the BMS bleeds the other cells instead.
+    /// Whether a BMS may bleed the cell without sending a bit that shows it. True for the cells of a balanced pack
+    /// without bits, except the lowest cell and cells with a reported leak. A leaking cell loses charge even while
+    /// the BMS bleeds the other cells instead.
     pub(super) fn may_be_bled(&self, index: usize) -> bool {
         let is_found = |found: &CellFault| found.kind == CellFaultKind::Leak && found.is_of(CellIndex(index as u16));
         let is_open = self.is_balanced && !self.cells[index].bleed.timer.has_bits;
         is_open && self.lowest != Some(index) && !self.findings.iter().any(is_found)
     }
 
-    /// Judges one cell for every kind of fault.
     fn judged(&self, index: usize, populations: &[Population; STATES]) -> [Judgement; 10] {
         let cell = &self.cells[index];
         let beyond = |state: usize, limit: f64, sign: f64| {
@@ -198,12 +197,11 @@ impl CellFaultDetector {
             // A leak soon makes this cell the lowest cell, which can be judged. Until then, the leak does no harm.
             leak = (ScalarGaussian { mean: 0.0, variance: 0.0 }, 0.0);
         } else if !cell.bleed.timer.has_bits && cell.difference.mean()[SOC] >= populations[SOC].middle {
-            // If a cell has more charge than the others, the BMS bleeds this cell until the charges are equal.
+            // A cell with more charge than the others may be losing it because the BMS bleeds it.
             leak = (ScalarGaussian { mean: leak.0.mean.min(0.0), ..leak.0 }, 0.0);
         }
-        // A leak explains a deviating voltage by a deviating charge. While a leak is likely, do not report an offset of
-        // the voltage channel, which would explain the voltage without a change of the charge. Do not report a foreign
-        // cell either.
+        // A likely leak already explains a deviating voltage. Then report neither an offset of the voltage channel
+        // nor a foreign cell.
         let unless_leaking =
             |(size, probability): (ScalarGaussian, f64)| (size, if leak.1 >= WITHDRAWN { 0.0 } else { probability });
         let (weak, foreign) =
@@ -213,15 +211,17 @@ impl CellFaultDetector {
             is_comparable,
             ..of(kind, (size, if is_comparable { probability } else { 0.0 }))
         };
-        // The curve of a label may have half or twice the true slope, which looks like these differences. A sudden
-        // change of the channel does not depend on the curve.
+        // If the model was derived from a label, its open-circuit curve may have half or twice the true slope. This
+        // error looks like a difference in capacity, resistance or channel offset. A sudden change of the channel
+        // does not depend on the curve.
         let if_known =
             |(size, probability): (ScalarGaussian, f64)| (size, if self.is_prior { 0.0 } else { probability });
         let (weak, foreign) = (if_known(weak), if_known(foreign));
         let (is_off, before_jump_v) = (channel.1 >= WITHDRAWN, cell.before_jump[CHANNEL]);
         let has_jumped = cell.jumped.is_some() && (channel.0.mean - before_jump_v).abs() >= fault::CHANNEL_V;
         let channel = if has_jumped { channel } else { if_known(channel) };
-        // Another fault of the cell explains its charge. Once the charge is listed, the other fault must be listed too.
+        // Another fault of the cell can explain its charge difference. If the charge difference is already a finding,
+        // only another finding explains it.
         let is_listed = |kind: CellFaultKind| {
             self.findings.iter().any(|found| found.kind == kind && found.is_of(CellIndex(index as u16)))
         };
@@ -249,10 +249,10 @@ impl CellFaultDetector {
         ]
     }
 
-    /// Difference in charge, and the probability that it is beyond the limit. `sign`: 1 for more charge than the other
-    /// cells, -1 for less. The probability is 0 while the cell's capacity is unknown. It is also 0 if the difference is
-    /// within the limit when the pack is nearly full or nearly empty: then the cell has another capacity, and its
-    /// charge is not constantly different.
+    /// Difference in charge, and the probability that it is beyond the limit. `sign`: 1 for more charge than the
+    /// other cells, -1 for less. The probability is 0 while the cell's capacity is unknown. It is also 0 if the
+    /// difference is within the limit when the pack is nearly full or nearly empty. The cell then has another
+    /// capacity.
     pub(super) fn constant_charge(
         &self,
         index: usize,
@@ -269,8 +269,8 @@ impl CellFaultDetector {
         let is_known = self.cells[index].difference.state(CAPACITY).std() <= KNOWN_CAPACITY_STD;
         let is_constant = is_known && CHARGE_AT.iter().all(|end| sign * at(end - soc).mean >= fault::CHARGE);
         let stands_out = sign * size.mean >= OUTLIER * populations[SOC].std;
-        // The voltage must show the charge. A charge and an offset of the channel that cancel each other are both
-        // unknown.
+        // The voltage must show the charge difference. If a charge difference and a channel offset cancel each other,
+        // both are unknown.
         let middle_v = self.slope_v * populations[SOC].middle + populations[CHANNEL].middle;
         let shown_v = self.cells[index].difference.reading_v(self.slope_v).mean - middle_v;
         let is_constant = is_constant && sign * shown_v >= fault::CHARGE * self.slope_v;
@@ -278,7 +278,7 @@ impl CellFaultDetector {
         (size, if is_constant && stands_out { probability } else { 0.0 })
     }
 
-    /// Updates the list of findings with a judgement. Returns the judgement as a finding, even if the finding is not
+    /// Updates the list of findings with a judgement. Also returns the judgement as a finding, even if it is not
     /// listed.
     fn take(&mut self, time: Timestamp, index: usize, judged: &Judgement) -> CellFault {
         let Judgement { kind, size, probability, .. } = *judged;
@@ -304,11 +304,10 @@ impl CellFaultDetector {
         finding
     }
 
-    /// Whether a fault of this kind has been likely for long enough to be reported. Some kinds have a waiting time. A
-    /// charge difference must be constant for a day, otherwise it may be the beginning of a leak. In a
-    /// balanced pack, the leak is unknown at first, so other changes look like a leak until the cell has completed a
-    /// cycle. A cell with more capacity than the others may belong to a replaced module, whose other cells are found
-    /// later.
+    /// Whether a fault of this kind has been likely for long enough to be reported. A charge difference must be
+    /// constant for a day, because it may be the beginning of a leak. In a balanced pack, a leak must also last for a
+    /// day. Until the cell has completed a cycle, other changes look like a leak. A cell with a higher capacity may
+    /// belong to a replaced module, whose other cells are found later.
     fn has_lasted(&self, kind: CellFaultKind, since: Timestamp, now: Timestamp) -> bool {
         let settling_s = match kind {
             CellFaultKind::Leak if self.is_balanced => DAY_S,
@@ -319,9 +318,9 @@ impl CellFaultDetector {
         now.since(since) >= settling_s
     }
 
-    /// Updates the list with a finding. A new finding is listed if its probability is at least [`REPORTED`] and it has
-    /// lasted long enough. A listed finding of the same kind and first cell is replaced, or removed if the probability
-    /// has become too low.
+    /// Updates the list with a finding. A new finding is listed if its probability is at least [`REPORTED`] and it
+    /// has lasted long enough. It replaces a listed finding of the same kind and first cell. If its probability is
+    /// too low, the listed finding is removed.
     pub(super) fn put(&mut self, finding: CellFault) {
         let first = |found: &CellFault| found.cells.map(|cells| cells.0);
         let is_same = |found: &CellFault| found.kind == finding.kind && first(found) == first(&finding);
@@ -339,21 +338,19 @@ impl CellFaultDetector {
         }
     }
 
-    /// Inserts a finding; the list stays ordered by cell.
     pub(super) fn insert(&mut self, finding: CellFault) {
         let at = self.findings.partition_point(|found| (found.cells, found.kind) < (finding.cells, finding.kind));
         self.findings.insert(at, finding);
     }
 
-    /// The module finding whose range includes the cell.
     fn module_of(&self, index: usize) -> Option<&CellFault> {
         let is_of = |found: &&CellFault| found.kind == CellFaultKind::Module && found.is_of(CellIndex(index as u16));
         self.findings.iter().find(is_of)
     }
 
-    /// Joins neighbouring cells into a replaced module, if they have had more capacity than the other cells since about
-    /// the same time. `foreign`: for each cell, the module finding that includes the cell. Without a module finding, it
-    /// is the finding that the cell has more capacity, if the probability of that finding is at least [`REPORTED`].
+    /// Joins neighbouring cells into a replaced module if they have had more capacity than the other cells since
+    /// about the same time. `foreign`: for each cell, the module finding that includes it. Otherwise, its finding of
+    /// a higher capacity with a probability of at least [`REPORTED`].
     fn find_modules(&mut self, time: Timestamp, foreign: &[Option<CellFault>]) {
         let is_same_event = |a: &Option<CellFault>, b: &Option<CellFault>| {
             a.zip(*b).is_some_and(|(a, b)| a.since.since(b.since).abs() <= SAME_MODULE_S)
@@ -368,7 +365,6 @@ impl CellFaultDetector {
         }
     }
 
-    /// Replaces the findings of single cells by one module finding.
     fn put_module(&mut self, time: Timestamp, cells: (CellIndex, CellIndex), group: &[Option<CellFault>]) {
         let found = || group.iter().flatten();
         let (count, kind) = (group.len() as f64, CellFaultKind::Module);
@@ -386,8 +382,8 @@ impl CellFaultDetector {
         self.findings.retain(|it| !is_within(it));
         self.insert(CellFault { kind, cells: Some(cells), since, reported, probability: 1.0, size });
         if earlier.is_none() {
-            // The cells next to the found module may also belong to the module, even though they changed less. Raise
-            // the uncertainty of these cells.
+            // The cells next to the module may also belong to it, even though they changed less. Raise their
+            // uncertainty.
             let edges = [cells.0.index().checked_sub(1), Some(cells.1.index() + 1)];
             for edge in edges.into_iter().flatten() {
                 self.cells.get_mut(edge).into_iter().for_each(|cell| cell.difference.widen_as(Jump::Replaced));

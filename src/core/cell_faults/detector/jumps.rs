@@ -8,8 +8,8 @@ use crate::quantity::{CellIndex, Timestamp};
 
 /// Jumps of several cells count as one event if they are at most this far apart (s).
 const SAME_EVENT_S: f64 = 1800.0;
-/// Two channels count as exchanged only if each cell's previous state explains the voltage of the other channel with an
-/// innovation of at most this size (V).
+/// If two channels are exchanged, the previous state of each cell predicts the voltage of the other channel to within
+/// this error (V).
 const SWAP_V: f64 = 0.008;
 
 impl CellFaultDetector {
@@ -40,8 +40,7 @@ impl CellFaultDetector {
         }
     }
 
-    /// If the channels of the cells `a` and `b` have been exchanged, exchanges the states of the cells and returns
-    /// true.
+    /// If the channels of the cells `a` and `b` have been exchanged, exchanges their states and returns true.
     fn exchange_if_swapped(
         &mut self,
         time: Timestamp,

@@ -1,4 +1,5 @@
-//! Computes what a cell's voltage difference in a row says about the cell's states.
+//! Computes what a cell's voltage difference in a row (sums of a few minutes of samples) says about the cell's
+//! states.
 //!
 //! In: the values of the row that all cells share, the means of a cell's states, and the cell's voltage minus the
 //! middle voltage of the pack (V). Out: an [`Observation`].
@@ -7,26 +8,25 @@ use crate::cell::{CellModel, GridPosition};
 use crate::cell_faults::difference::{CHANNEL, CONTACT, Observation, RESISTANCE, SOC, STATES};
 use crate::filter::ScalarGaussian;
 
-/// Standard deviations of the errors of a row: `ROW_V` of the voltage (V); `ROW_DROP` of the voltage drop, as a
-/// fraction of the drop; `ROW_CURVE` of the SOC on the open-circuit curve, fraction.
+/// Standard deviations of a row's errors: voltage (V), voltage drop (fraction of the drop), and SOC on the
+/// open-circuit curve (fraction).
 const ROW_V: f64 = 0.002;
 const ROW_DROP: f64 = 0.03;
 const ROW_CURVE: f64 = 0.001;
-/// Additional errors of a cell per unit of SOC difference from the mean cell: `FAR_V` of the open-circuit curve (V);
-/// `FAR_DROP` of the voltage drop, fraction. `MOST_ELSEWHERE` limits the ratio between the model's resistances at the
-/// two SOC values.
+/// Additional errors of a cell, per unit of SOC difference from the mean cell: `FAR_V` in the open-circuit voltage
+/// (V) and `FAR_DROP` in the voltage drop (fraction). `MOST_ELSEWHERE` limits the ratio between the model's
+/// resistances at the two SOC values.
 const FAR_V: f64 = 0.05;
 const FAR_DROP: f64 = 1.0;
 const MOST_ELSEWHERE: f64 = 3.0;
 /// Values of a row that all cells share.
 pub(super) struct Row<'a> {
     pub(super) model: &'a CellModel,
-    /// Factor between the true slope of the curve and the model's, with the variance of its error
+    /// True slope of the open-circuit curve divided by the model's slope, with the variance of its error
     /// ([`PackSlope::factor`](crate::cell_faults::pack_slope::PackSlope::factor)).
     pub(super) factor: ScalarGaussian,
     pub(super) capacity_ah: f64,
     pub(super) soc: f64,
-    /// SOC on the model's curve.
     pub(super) curve_soc: f64,
     pub(super) temperature_c: f64,
     pub(super) current_a: f64,
@@ -35,8 +35,8 @@ pub(super) struct Row<'a> {
 }
 
 impl Row<'_> {
-    /// Observation of `difference_v`, a cell's voltage minus the middle voltage of the pack, linearised at the means of
-    /// the cell's states. `soc_variance`: variance of the state [`SOC`].
+    /// Compares `difference_v`, a cell's voltage minus the middle voltage of the pack, with its expected value. The
+    /// result is linearised at the means of the cell's states. `soc_variance`: variance of the state [`SOC`].
     pub(super) fn observation(&self, means: &[f64; STATES], soc_variance: f64, difference_v: f64) -> Observation {
         let (model, own, middle) = (self.model, self.at(means[SOC]), self.at(0.0));
         let model_slope_v = model.ocv_slope_v(&own, self.capacity_ah).max(0.0);
@@ -58,23 +58,21 @@ impl Row<'_> {
         Observation { innovation: difference_v - expected_v, slope, variance }
     }
 
-    /// Grid position of a cell whose SOC differs from the mean cell's SOC by `charge` (fraction).
     fn at(&self, charge: f64) -> GridPosition {
         self.model.grid_position((self.curve_soc + charge).clamp(0.0, 1.0), self.temperature_c)
     }
 
-    /// Open-circuit voltage minus the mean cell's, by the model, for a cell whose SOC differs by `charge` (V).
+    /// Difference in open-circuit voltage (V) that the model gives for a SOC that differs by `charge` from the mean
+    /// cell's.
     pub(super) fn curve_v(&self, charge: f64) -> f64 {
         let ocv_v = |charge: f64| self.model.aged_ocv_v(&self.at(charge), self.capacity_ah);
         ocv_v(charge) - ocv_v(0.0)
     }
 
-    /// Slope of the model's open-circuit curve in the row (V per unit of SOC).
     pub(super) fn model_slope_v(&self) -> f64 {
         self.model.ocv_slope_v(&self.at(0.0), self.capacity_ah)
     }
 
-    /// Series resistance of the mean cell in the row (ohm).
     pub(super) fn ohm(&self) -> f64 {
         self.model.r0_ohm(&self.model.grid_position(self.soc, self.temperature_c))
     }

@@ -1,4 +1,5 @@
-//! Tests the cell fault detector with cells that are not compared.
+//! Tests the cell fault detector on simulated packs, with models derived from labels and with cells that are not
+//! compared.
 
 use super::*;
 use crate::cell::chemistry::{Chemistry, Label};
@@ -32,20 +33,20 @@ fn cell_no_longer_compared_is_reset() {
     assert_eq!((stored.cells[4].settled[SOC], stored.cells[1].settled[SOC]), (0.0, 0.3));
 }
 
-/// Open-circuit voltage of the true cells: the model's curve with another slope in each half (V).
+/// Open-circuit voltage of the simulated cells (V). `slopes`: factors of the model's slope below and above SOC 0.5.
 fn true_ocv_v(model: &CellModel, slopes: [f64; 2], soc: f64) -> f64 {
     let at_v = |soc: f64| model.ocv_v(&model.grid_position(soc, 25.0));
     at_v(0.5) + slopes[usize::from(soc > 0.5)] * (at_v(soc) - at_v(0.5))
 }
 
-/// Runs a detector with the model of a label for eight days of discharge, rest and charge. The cells differ only in
-/// charge (`charges`, fraction); their curve has other slopes than the model's curve.
+/// Simulates eight days of discharge, rest and charge, and returns the detector. The cells differ only in charge
+/// (`charges`, fraction). `slopes`: error of the model's open-circuit curve, see [`true_ocv_v`].
 fn watched(charges: &[f64], slopes: [f64; 2]) -> CellFaultDetector {
     watched_with_offset(charges, slopes, 0.0, true)
 }
 
-/// As [`watched`], but the channel of cell 4 has an offset from the first day (V). `is_prior`: whether the model is the
-/// model of a label.
+/// Like [`watched`], but the channel of cell 4 has an offset (V) from the first day. `is_prior`: whether the detector
+/// assumes that the model was derived from a label.
 fn watched_with_offset(charges: &[f64], slopes: [f64; 2], offset_v: f64, is_prior: bool) -> CellFaultDetector {
     const CAPACITY_AH: f64 = 100.0;
     let model = Label::usual(Chemistry::NmcGraphite, CAPACITY_AH).model().expect("a model");
@@ -66,7 +67,7 @@ fn watched_with_offset(charges: &[f64], slopes: [f64; 2], offset_v: f64, is_prio
             };
             let time = Timestamp::from_secs(seconds);
             for (cell, charge) in charges.iter().enumerate() {
-                // The error of a usual cell monitor: noise of 1 mV.
+                // Noise of 1 mV, as in a typical cell monitor.
                 let noise_v = 0.001 * f64::from((7 * cell as u32 + 13 * step) % 11).mul_add(0.2, -1.0);
                 let offset_v = if cell == 4 { offset_v } else { 0.0 };
                 let voltage_v = true_ocv_v(&model, slopes, soc + charge) - ohm * current_a + noise_v + offset_v;
@@ -101,7 +102,7 @@ fn low_charge_is_found_with_wrong_curve() {
 #[test]
 fn healthy_cells_have_no_finding_with_wrong_curve() {
     for slopes in SLOPES {
-        // As in a car whose pack is out of balance: the charge rises from the first cell to the last one.
+        // The charge rises from the first cell to the last cell, as in a car whose pack is out of balance.
         let charges: Vec<f64> = (0..24).map(|cell| 0.004 * f64::from(cell) - 0.04).collect();
         let detector = watched(&charges, slopes);
         assert_eq!(detector.findings(), [], "{slopes:?}");

@@ -1,4 +1,4 @@
-//! Readings of a small pack, with and without a thermal event.
+//! Tests the thermal watch with simulated readings of a small pack.
 
 use super::*;
 
@@ -13,14 +13,14 @@ struct Pack {
     temperatures_c: [f64; SENSORS],
     rate_per_h: Option<f64>,
     least_soc: f64,
-    /// Readings arrive every this many seconds.
+    /// Time between two readings (s).
     every: u32,
-    /// Relative currents of the cells; the cells of a module of another kind have another one.
+    /// Current of each cell relative to the pack's current. In a module of another kind, this factor differs.
     rate_factors: [f64; CELLS],
 }
 
 impl Pack {
-    /// Two minutes of rest.
+    /// Creates a pack and simulates two minutes of rest.
     fn at_rest() -> Self {
         let mut pack = Self {
             watch: ThermalWatch::new(CELLS, SENSORS),
@@ -40,8 +40,8 @@ impl Pack {
         Timestamp::from_secs(f64::from(self.second))
     }
 
-    /// Runs for some seconds; `change` changes the pack before each second. Returns the second of the first evidence, its
-    /// cell and its value.
+    /// Simulates some seconds and calls `change` before each second. Returns second, cell and value of the first
+    /// evidence.
     fn run(&mut self, seconds: u32, mut change: impl FnMut(u32, &mut Self)) -> Option<(u32, usize, f64)> {
         for second in 0..seconds {
             change(second, self);
@@ -110,7 +110,7 @@ fn other_falls_raise_no_event() {
     assert_eq!(empty.run(300, |second, pack| pack.volts[2] = 2.5 + moving(second)), None, "almost empty");
     let flicker = |second: u32, pack: &mut Pack| pack.volts[2] = if second % 3 == 2 { 3.7 } else { 0.5 };
     assert_eq!(rest().run(300, flicker), None, "disturbance of two seconds");
-    // A contact of 5 mohm in a cell of 126 Ah, and 2 C.
+    // A contact of 5 mohm at a cell of 126 Ah, with a current of 2 C.
     let contact = |second: u32, pack: &mut Pack| {
         pack.rate_per_h = Some(2.0);
         pack.volts = [3.6; CELLS];
@@ -170,7 +170,7 @@ fn slow_readings_show_collapse_at_every_phase() {
 
 #[test]
 fn fast_rise_of_temperature_is_found() {
-    // A rise of all sensors counts too, because no current explains it.
+    // A rise of all sensors also counts, because no current explains it.
     for all in [false, true] {
         let found = Pack::at_rest().run(60, |_, pack| {
             pack.temperatures_c[1] += 1.2;
@@ -190,7 +190,7 @@ fn sensor_ahead_of_others_is_found() {
     let found = Pack::at_rest().run(300, |_, pack| pack.temperatures_c[1] += 0.12);
     assert_eq!(found.map(|(_, cell, evidence)| (cell / 2, evidence)), Some((1, 2.0)));
     assert!((90..120).contains(&found.unwrap().0), "{found:?}");
-    // Slower, or together with the others, is no event.
+    // A slower rise, or a rise together with the other sensors, is not an event.
     for (own, others) in [(0.06, 0.0), (0.12, 0.1)] {
         let found = Pack::at_rest().run(600, |_, pack| {
             pack.temperatures_c = [others, own, others].map(|rate| rate * f64::from(pack.second - 120) + 25.0);
@@ -201,7 +201,8 @@ fn sensor_ahead_of_others_is_found() {
 
 #[test]
 fn heat_of_current_is_deducted() {
-    // 4 C: 1.6 degrees C/s at first, 80 in all, 16 between the sensors.
+    // At 4 C, the current explains 1.6 degrees C/s at first, a rise of 80 degrees C, and 16 degrees C between the
+    // sensors.
     let mut pack = Pack { rate_per_h: Some(-4.0), ..Pack::at_rest() };
     let mut warmer = |_, pack: &mut Pack| {
         pack.temperatures_c = pack.temperatures_c.map(|it| it + 0.05 * (105.0 - it).clamp(0.0, 32.0));
@@ -241,14 +242,15 @@ fn decay(second: u32, tau_s: f64) -> f64 {
     libm::exp(-f64::from(second) / tau_s)
 }
 
-/// Between -1 and 1.
+/// Pseudo-random value between -1 and 1.
 fn noise(second: u32) -> f64 {
     f64::from(second.wrapping_mul(2_654_435_761) >> 16) / 32_768.0 - 1.0
 }
 
 #[test]
 fn sensor_that_returns_from_failure_raises_no_event() {
-    // Offset of the sensors from their median, failing sensors, duration of the failure, time constant of the return.
+    // The loops vary the offset of the sensors (degrees C), the number of failing sensors, the duration of the
+    // failure (s) and the time constant of the recovery (s).
     for offset_c in [-2.0, 0.0, 2.0, 5.0] {
         for failing in [1, SENSORS] {
             for (failure_s, tau_s) in
@@ -264,7 +266,7 @@ fn sensor_that_returns_from_failure_raises_no_event() {
                 pack.run(200, |_, _| {});
                 let found = pack.run(1200, fails);
                 assert_eq!(found, None, "{offset_c} degrees C, {failing} sensors, {failure_s} s, {tau_s} s");
-                // Afterwards, the sensor is watched again.
+                // After the recovery, the sensor is watched again.
                 assert!(pack.run(60, |_, pack| pack.temperatures_c[0] += 2.0).is_some());
             }
         }

@@ -1,32 +1,34 @@
-//! Computes the distribution of the use until a cell's level (its capacity without recovery) falls below a threshold,
-//! as a mixture of fade shapes.
+//! Computes the distribution of the use until a cell's level (its capacity without recovery) falls below a threshold.
+//! The distribution is a mixture of fade shapes.
 //!
-//! In: level, rate of fade and their standard deviations, and the loss and use since the highest level. Out:
+//! In: level and rate of fade with their standard deviations, and the loss and use since the highest level. Out:
 //! probabilities and quantiles of the use. Losses and capacities are fractions of the reference capacity.
 //!
-//! Shapes: the rate of fade is r ((l + l0) / (lost + l0))^a, with the present rate r, the loss l since the highest
-//! level, the present loss `lost`, and l0 = [`ONSET`]. The exponent a sets the shape: a = -1 is a square root of the
-//! use, 0 a straight line, 0.5 a parabola, 1 an exponential, and above 1 a knee that becomes steeper without limit. The
-//! use for a loss from l1 to l2 has a closed form ([`use_of_loss`]).
+//! Shapes: the rate of fade is r ((l + l0) / (lost + l0))^a. Here, r is the present rate, l is the loss since the
+//! highest level, `lost` is the present loss, and l0 is [`ONSET`]. The exponent a sets the shape of the loss as a
+//! function of the use: a = -1 is a square root, 0 a straight line, 0.5 a parabola, and 1 an exponential. An exponent
+//! above 1 is a knee that becomes steeper without limit. The use for a loss from l1 to l2 has a closed form
+//! ([`use_of_loss`]).
 //!
 //! The posterior of (a, ln r) on a grid of [`SHAPES`] x [`RATES`] nodes is the product of four terms:
-//! * the prior of the exponent: a t distribution around [`EXPONENT`], and with the weight [`STEADY_SHARE`] a normal
-//!   distribution around a straight line;
-//! * the prior of the mean rate over the next [`TYPICAL_LOSS`], a Cauchy distribution (see [`PriorRate`]). Its heavy
-//!   tails let a measured rate replace it. It answers for a cell that has hardly lost capacity;
+//! * the prior of the exponent: a t distribution around [`EXPONENT`], mixed with a normal distribution around a
+//!   straight line (weight [`STEADY_SHARE`]);
+//! * the prior of the mean rate over the next [`TYPICAL_LOSS`]: a Cauchy distribution (see [`PriorRate`]), which
+//!   dominates for a cell that has hardly lost capacity. Because of its heavy tails, a measured rate can replace it;
 //! * the rate that the filter has found;
-//! * the curvature so far: shape and rate together state the use since the highest level. The deviation from the use
-//!   that has passed has a t distribution.
+//! * the curvature so far: shape and rate together imply the use since the highest level. The deviation from the actual
+//!   use has a t distribution.
 //!
-//! The use until the threshold is the use of the shape, for [`SLICES`] slices of the uncertain level, times a lognormal
-//! deviation: a future change of the rate ([`SPREAD_LOSS`]), and the error of any shape ([`SPREAD`]).
+//! The use until the threshold is computed from the shape, for [`SLICES`] slices of the uncertain level. It is
+//! multiplied by a lognormal deviation, which covers future changes of the rate ([`SPREAD_LOSS`]) and the error of any
+//! shape ([`SPREAD`]).
 //!
 //! Assumptions: the level passes the threshold once. The posterior does not depend on the threshold, so probabilities
 //! for several thresholds agree with each other.
 
 use crate::filter::{bell, normal_cdf, square};
 
-/// Loss at which the acceleration of a fade begins (fraction of the reference). Below it, all shapes are nearly
+/// Loss at which the acceleration of a fade begins (fraction of the reference). Below this loss, all shapes are nearly
 /// straight lines.
 const ONSET: f64 = 0.03;
 /// Prior of the exponent: centre and scale of a t distribution with [`EXPONENT_FREEDOM`] degrees of freedom.
@@ -35,34 +37,33 @@ const EXPONENT_FREEDOM: f64 = 3.0;
 /// Prior probability of a steady fade, and standard deviation of its exponent around 0.
 const STEADY_SHARE: f64 = 0.05;
 const STEADY_STD: f64 = 0.5;
-/// Scale of the relative deviation between the loss that a shape implies and the loss that was seen.
+/// Scale of the relative deviation between the loss that a shape implies and the observed loss.
 const CURVATURE: f64 = 0.3;
-/// Scale of the same deviation for a small loss (fraction of the reference).
+/// Scale of this deviation for a small loss (fraction of the reference).
 const CURVATURE_FLOOR: f64 = 0.01;
 /// Loss over which the prior of the rate is stated.
 const TYPICAL_LOSS: f64 = 0.1;
 /// Equivalent full cycles in which a typical cell loses `TYPICAL_LOSS`: 800 cycles to 80 %.
 const TYPICAL_CYCLES: f64 = 400.0;
-/// Scale of the prior of the rate's logarithm, in cycles and in days.
+/// Scale of the prior of ln(rate), for a rate per cycle and for a rate per day.
 const TYPICAL_SCALE: (f64, f64) = (0.7, 2.0);
-/// Smallest loss that is assumed if the prior of the rate is the mean rate so far (fraction of the reference).
+/// Added to the loss (fraction of the reference) if the prior is the mean rate so far, so that this rate is above 0.
 const LEAST_LOSS: f64 = 0.01;
-/// Standard deviation of the logarithm of the use, per square root of an e-fold of the loss.
+/// Standard deviation of ln(use) over one e-fold of the loss. It grows with the square root of the number of e-folds.
 const SPREAD_LOSS: f64 = 0.25;
-/// Standard deviation of the logarithm of the use, for any loss.
+/// Standard deviation of ln(use), for any loss.
 const SPREAD: f64 = 0.23;
 
 /// First exponent of the grid, step, and number of exponents: -1.5 to 4.5.
 const FIRST_EXPONENT: f64 = -1.5;
 const EXPONENT_STEP: f64 = 0.5;
 const SHAPES: usize = 13;
-/// Number of rates of the grid.
 const RATES: usize = 41;
 /// Number of slices of the level, and half-width of the range that is divided into slices (standard deviations). The
 /// last slice also contains the upper tail.
 const SLICES: usize = 7;
 const SLICED: f64 = 3.5;
-/// Number of bins of the logarithm of the use, and their width. The bins cover 32 e-folds.
+/// Number of bins of ln(use), and their width. The bins cover 32 e-folds.
 const BINS: usize = 320;
 const BIN: f64 = 0.1;
 /// Node weights below this share of the sum are ignored.
@@ -74,24 +75,24 @@ pub(super) const HALVINGS: u32 = 24;
 /// Prior of the mean rate over the next [`TYPICAL_LOSS`].
 #[derive(Debug, Clone, Copy)]
 pub(super) enum PriorRate {
-    /// Per equivalent full cycle: mean of a typical cell's rate and of the rate since the highest level. The rate of
-    /// the cell counts more, the more it has lost.
+    /// Rate per equivalent full cycle: mean of a typical cell's rate and of the cell's rate since the highest level.
+    /// The weight of the cell's own rate grows with its use.
     PerCycle,
-    /// Mean rate since the first reading. Use in days differs too much between cells for a typical rate.
+    /// Rate per day: mean rate since the first reading. Rates per day differ too much between cells for a typical rate.
     SoFar {
         /// Days since the first reading.
         days: f64,
     },
 }
 
-/// What the filter knows of a cell.
+/// State of a cell's filter.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct FadeState {
     /// Level, mean and standard deviation.
     pub(super) level: (f64, f64),
     /// Rate of fade per unit of use, mean and standard deviation (above 0).
     pub(super) rate: (f64, f64),
-    /// Loss is counted from this level.
+    /// Level from which the loss is counted.
     pub(super) new_level: f64,
     /// Highest level; lower than `new_level` if the first reading came from an aged cell.
     pub(super) top_level: f64,
@@ -104,7 +105,7 @@ pub(super) struct FadeState {
 #[derive(Debug, Clone)]
 pub(super) struct FadePosterior {
     state: FadeState,
-    /// Logarithm of the first rate of the grid, and step.
+    /// ln of the first rate of the grid, and step.
     log_rates: (f64, f64),
     /// Probability of each exponent and rate; the sum is 1.
     weights: [[f64; RATES]; SHAPES],
@@ -113,7 +114,7 @@ pub(super) struct FadePosterior {
 /// Distribution of the use until the crossing.
 #[derive(Debug, Clone)]
 pub(super) struct Crossing {
-    /// Logarithm of the use at the lower end of the first bin.
+    /// ln of the use at the lower end of the first bin.
     start: f64,
     /// Probability that the level has passed the threshold before the upper end of each bin.
     cumulative: [f64; BINS],
@@ -127,7 +128,7 @@ impl FadePosterior {
         let lost = state.lost(state.level.0);
         let at_top = state.lost(state.top_level).min(lost);
         let (typical, scale) = match state.prior {
-            // As if the cell had behaved like a typical cell before it was observed.
+            // Treats the cell as if it had first behaved like a typical cell for [`TYPICAL_CYCLES`].
             PriorRate::PerCycle => ((TYPICAL_LOSS + lost - at_top) / (TYPICAL_CYCLES + since_top), TYPICAL_SCALE.0),
             PriorRate::SoFar { days } => ((lost - ONSET + LEAST_LOSS) / days, TYPICAL_SCALE.1),
         };
@@ -213,7 +214,7 @@ impl FadePosterior {
 }
 
 impl FadeState {
-    /// Loss at a level since the highest level, plus [`ONSET`].
+    /// Loss from `new_level` to `level`, plus [`ONSET`].
     fn lost(&self, level: f64) -> f64 {
         (self.new_level - level).max(0.0) + ONSET
     }
@@ -257,13 +258,13 @@ fn exponent_density(exponent: f64) -> f64 {
     (1.0 - STEADY_SHARE) * knee + STEADY_SHARE * PEAKS * bell(exponent / STEADY_STD) / STEADY_STD
 }
 
-/// Range of the logarithm of the rate that contains the posterior.
+/// Range of ln(rate) that contains the posterior.
 fn log_rate_range(rate: f64, rate_std: f64, log_typical: f64) -> (f64, f64) {
     if rate > 3.0 * rate_std {
         let half = (6.0 * rate_std / rate).clamp(0.3, 3.0);
         return (libm::log(rate) - half, libm::log(rate) + half);
     }
-    // The data do not exclude that the rate is near 0; the prior bounds it.
+    // The data do not exclude a rate near 0, so the prior bounds the rate.
     let last = libm::log(rate + 4.0 * rate_std);
     ((last - 8.0).min(log_typical - 6.0), last)
 }
@@ -278,7 +279,6 @@ fn use_of_loss(exponent: f64, from: f64, to: f64) -> f64 {
     from * e_folds * mean
 }
 
-/// Turns logarithms of weights into weights with the sum 1.
 fn normalise(weights: &mut [[f64; RATES]; SHAPES]) {
     let largest = weights.iter().flatten().fold(f64::NEG_INFINITY, |most, &weight| most.max(weight));
     weights.iter_mut().flatten().for_each(|weight| *weight = libm::exp(*weight - largest));
@@ -286,8 +286,8 @@ fn normalise(weights: &mut [[f64; RATES]; SHAPES]) {
     weights.iter_mut().flatten().for_each(|weight| *weight /= sum);
 }
 
-/// Convolves the bins with a normal distribution with the standard deviation `std` (bins). What leaves the range is
-/// kept in the outermost bins.
+/// Convolves the bins with a normal distribution with the standard deviation `std` (bins). Probability beyond the range
+/// is kept in the outermost bins.
 fn spread_bins(bins: &[f64; BINS], std: f64) -> [f64; BINS] {
     let reach = ((4.0 * std) as usize).min(BINS / 2);
     let mut kernel = [0.0; BINS / 2 + 1];
@@ -312,7 +312,7 @@ fn spread_bins(bins: &[f64; BINS], std: f64) -> [f64; BINS] {
 mod tests {
     use super::*;
 
-    /// A cell with 10 % of loss after 100 units of use, fading at a known rate.
+    /// A cell that has lost 10 % in 100 units of use and fades at a known rate.
     fn state(rate: f64) -> FadeState {
         FadeState {
             level: (0.9, 1e-4),
@@ -339,7 +339,8 @@ mod tests {
 
     #[test]
     fn curvature_so_far_decides_the_shape() {
-        // The same loss and the same present rate: the cell that lost less before has the steeper shape.
+        // Both cells have the same loss and the same present rate. The cell that faded more slowly before has the
+        // steeper shape.
         let steady = median(state(0.001));
         let steep = median(FadeState { since_top: 300.0, ..state(0.001) });
         assert!(steady > 60.0 && steep < 0.95 * steady, "{steady} {steep}");

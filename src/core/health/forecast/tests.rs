@@ -25,7 +25,7 @@ fn interval_covers_straight_continuation_before_knee() {
     let forecast = fed(|efc| 2.0 - 0.001 * efc, 1.0, 100.0);
     let life = forecast.remaining(1.8).expect("enough is known");
     let cycles = life.cycles.expect("cycles are counted");
-    // The cell has 1.9 Ah now, 0.1 Ah above the threshold: 100 cycles at the present rate. Most cells accelerate.
+    // The cell is 0.1 Ah above the threshold: 100 cycles at the present rate. Most cells accelerate.
     assert!((75.0..100.0).contains(&cycles.median), "{cycles:?}");
     assert!(cycles.low < 100.0 && cycles.high > 100.0 && cycles.high < 8.0 * cycles.low, "{cycles:?}");
     let days = life.days.expect("the rate of use is known");
@@ -36,8 +36,8 @@ fn interval_covers_straight_continuation_before_knee() {
 fn interval_covers_fade_with_and_without_knee() {
     let forecast = fed(|efc| 2.0 - 0.002 * efc, 1.0, 100.0);
     let cycles = forecast.remaining(1.6).expect("enough is known").cycles.expect("cycles are counted");
-    // The cell has 1.8 Ah now, 0.2 Ah above the threshold: 100 cycles at the present rate, 41 if the rate grew by a
-    // factor of e^0.9 at once.
+    // The cell is 0.2 Ah above the threshold: 100 cycles at the present rate. If the rate grew by a factor of e^0.9 at
+    // once, 41 cycles would remain.
     assert!((45.0..90.0).contains(&cycles.median) && cycles.low < 45.0 && cycles.high > 100.0, "{cycles:?}");
 }
 
@@ -52,7 +52,7 @@ fn tenfold_slower_fade_lasts_tenfold_longer() {
 
 #[test]
 fn readings_within_one_cycle_count_less() {
-    // A recovery with a time constant of ten cycles, every 0.05 cycles, from a generator with a fixed seed.
+    // A recovery with a time constant of ten cycles, sampled every 0.05 cycles. The random generator has a fixed seed.
     let (mut seed, mut recovery) = (1_u64, 0.0);
     let recoveries: Vec<f64> = (0..=2000)
         .map(|_| {
@@ -77,10 +77,10 @@ fn noise_is_learned_from_the_readings() {
 
 #[test]
 fn loss_counts_from_the_highest_level() {
-    // The capacity rises by 4 % in 40 cycles, then falls by 4 % in 80.
+    // The capacity rises by 4 % in 40 cycles, then falls by 4 % in 80 cycles.
     let forecast = fed(|efc| if efc < 40.0 { 2.0 + 0.002 * efc } else { 2.08 - 0.001 * (efc - 40.0) }, 1.0, 120.0);
     assert!((forecast.x[TOP] - 1.04).abs() < 0.01, "{forecast:?}");
-    // 0.2 Ah above the threshold: 200 cycles at the present rate.
+    // The cell is 0.2 Ah above the threshold: 200 cycles at the present rate.
     let cycles = forecast.remaining(1.8).expect("enough").cycles.expect("cycles");
     assert!(cycles.low < 100.0 && (80.0..250.0).contains(&cycles.median) && cycles.high > 250.0, "{cycles:?}");
 }
@@ -140,7 +140,7 @@ fn days_axis_gives_days_only() {
     }
     let life = forecast.remaining(1.2).expect("enough is known");
     assert_eq!(life.cycles, None);
-    // The cell has 1.45 Ah now, 0.25 Ah above the threshold, and loses 0.01 Ah per day.
+    // The cell is 0.25 Ah above the threshold and loses 0.01 Ah per day.
     assert!(life.days.is_some_and(|days| (days.median - 25.0).abs() < 5.0), "{life:?}");
 }
 
@@ -150,7 +150,7 @@ fn use_without_reading_shortens_remaining_life() {
     let before = forecast.remaining(1.8).expect("enough").cycles.expect("cycles").median;
     (0..50).for_each(|_| forecast.update(passed(1.0), None));
     let after = forecast.remaining(1.8).expect("enough").cycles.expect("cycles").median;
-    // The filter continues at the present rate. The forecast from an earlier loss expects a longer life.
+    // The two forecasts start from different losses, so the difference is not exactly 50 cycles.
     assert!((25.0..58.0).contains(&(before - after)), "{before} {after}");
 }
 
@@ -210,7 +210,7 @@ fn nightly_rest_does_not_hide_the_fade() {
     }
     let recovery_std = forecast.p[RECOVERY][RECOVERY].sqrt();
     assert!(recovery_std < 1.1 * RECOVERY_IN_REST.hypot(RECOVERY_IN_USE), "{recovery_std}");
-    // The cell has 1.6 Ah now, 0.1 Ah above the threshold, and loses 0.004 Ah per cycle.
+    // The cell is 0.1 Ah above the threshold and loses 0.004 Ah per cycle.
     let cycles = forecast.remaining(1.5).expect("enough is known").cycles.expect("cycles");
     assert!(cycles.low < 25.0 && cycles.high > 25.0 && cycles.median > 15.0 && cycles.median < 35.0, "{cycles:?}");
 }

@@ -65,7 +65,7 @@ fn half_cycle_without_new_voltages_measures_nothing() {
     assert!(!learner.has_learned_all());
     let first = learner.learn(&small_model(), &config, 0, &mut estimator, &moved);
     assert!(first.measurement.is_some() && learner.has_learned_all());
-    // Without new voltages, the information that has already been used must not count again.
+    // Without new voltages, the information that has already been used does not count again.
     let second = learner.learn(&small_model(), &config, 0, &mut estimator, &moved);
     assert_eq!(second.measurement, None);
     assert_eq!(moved.swing.map(|swing| swing.mean), Some(0.5));
@@ -102,7 +102,6 @@ fn half_cycle_with_filter_restart_measures_nothing() {
     assert_eq!(learner.capacity(0).mean, sure.mean);
     assert!((learner.capacity(0).variance / new_variance - 1.0).abs() < 1e-9, "{:?}", learner.capacity(0));
     assert!(estimator.capacity().variance >= new_variance * (1.0 - 1e-9), "{:?}", estimator.capacity());
-    // Store and restore between the restart and the end of the half-cycle.
     let text = serde_json::to_string(&learner).expect("writes");
     let mut learner: Learner = serde_json::from_str(&text).expect("reads");
     let in_doubt = learn(&mut learner, &mut estimator);
@@ -172,8 +171,8 @@ fn contradicting_half_cycle_widens_belief_and_changes_no_capacity() {
     assert!((update.capacity.std() - widest).abs() < 1e-9, "{update:?} {widest}");
 }
 
-/// Runs three discharges from SOC 0.9 to 0.3, and charges, of a cell of 1.6 Ah whose label says 2.0 Ah. Returns the
-/// learner. The cell model is a label's, and the voltages show the true SOC. `is_doubtful`: whether the current is
+/// Runs three discharges from SOC 0.9 to 0.3, each followed by a charge, with a cell of 1.6 Ah whose label says 2.0 Ah.
+/// The cell model comes from the label, and the voltages show the true SOC. `is_doubtful`: whether the current is
 /// doubtful in the first part of each discharge and at the end of each charge.
 fn learned_by_label(is_doubtful: bool) -> Learner {
     let transition = TransitionConfig { dead_band_a: 0.05, hysteresis_a: 0.05, min_duration_s: 0.0, min_swing: 0.02 };
@@ -218,7 +217,7 @@ fn label_learns_capacity_from_trips_and_charges() {
     assert!(learner.has_learned(0), "{capacity:?}");
     assert!((capacity.mean - 1.6).abs() < 2.0 * capacity.std(), "{capacity:?}");
     assert!(capacity.mean < 1.8 && capacity.std() < 0.17, "{capacity:?}");
-    // The curve's error is the same in all spans.
+    // The curve's error is the same in all spans, so the uncertainty stays above 0.
     assert!(capacity.std() > 0.02, "{capacity:?}");
 }
 

@@ -155,13 +155,13 @@ fn weakest_and_fullest_cell_limit_pack() {
     let one = of_one(cells[2], (Mode::Charge, -0.5));
     assert_eq!(outlook.to_full_s, one.to_full_s);
     assert_eq!(outlook.limiting_cells, [CellIndex(1), CellIndex(2)]);
-    // 0.4 Ah from four cells at about 3.0 + 1.2 SOC in two strings, at C/2.
+    // Expected: 0.4 Ah from each of four cells in two strings, at C/2. The open-circuit voltage is about 3.0 + 1.2 SOC.
     near(outlook.remaining_wh.mean, 2.0 * 0.4 * (3.48 + 3.12 + 3.96 + 3.48 - 4.0 * 0.1), 0.03);
     // A cell with a high resistance is empty first, although it contains more charge.
     cells[3].resistance_ratio = 3.0_f64.exp();
     let weak = of_pack(&CONFIG, (&charge, Mode::Charge), &cells, &pack).unwrap();
     assert!(weak.remaining_wh.mean < 0.7 * outlook.remaining_wh.mean, "{weak:?}");
-    // The target of the pack is unreachable: the fullest cell is full before.
+    // The pack cannot reach the target, because its fullest cell is full first.
     let far = OutlookConfig { target_soc: 1.0, max_voltage_v: Some(4.15), ..CONFIG };
     let times = of_pack(&far, (&charge, Mode::Charge), &cells, &pack).unwrap();
     assert!(times.to_full_s.is_some() && times.to_target_s.is_none(), "{times:?}");
@@ -177,7 +177,7 @@ fn each_error_widens_what_depends_on_it() {
         of_one(cell, (Mode::Discharge, 1.0))
     };
     let known = of(|_| {});
-    // The load alone is unknown: 1.2 Ah at 1 A through 0.08 to 0.12 ohm, or a third more.
+    // Only the future load is uncertain: 1.2 Ah at 1 A through 0.08 to 0.12 ohm, or a load that is a third larger.
     near(known.remaining_wh.std(), LOG_LOAD_STD.exp_m1() * 1.2 * 0.095, 0.08);
     near(known.to_empty_s.unwrap().std(), LOG_LOAD_STD.exp_m1() * 1.2 * 3600.0, 0.01);
     assert!(known.discharge_w.iter().chain(&known.charge_w).all(|power| power.variance == 0.0));
@@ -186,7 +186,7 @@ fn each_error_widens_what_depends_on_it() {
     near(more(&of(|cell| cell.capacity.variance = square(0.1))), 0.05 * known.remaining_wh.mean, 0.05);
     let by_resistance = of(|cell| cell.log_resistance_std = 0.1);
     near(by_resistance.discharge_w[1].std(), 0.1 * known.discharge_w[1].mean, 0.15);
-    // At the end of the scale, the error lies on one side.
+    // At a SOC of 0, the error can lie on one side only.
     let empty = of(|cell| (cell.soc.mean, cell.soc.variance) = (0.0, square(0.02)));
     near(empty.remaining_wh.std(), 0.02 * 2.0 * 2.9, 0.05);
 }
@@ -203,7 +203,8 @@ fn charge_counts_after_minute_and_ends_at_weak_charger() {
         of_pack(&CONFIG, (&load, Mode::Charge), &[cell(&model, 0.5)], &pack).unwrap().to_full_s
     };
     assert_eq!(time_s(59, 1.0), None, "braking");
-    // The charger is weaker than the taper current of 0.1 A, so the charge ends when it reaches the voltage.
+    // The charger is weaker than the taper current of 0.1 A, so the charge ends when the cell reaches its highest
+    // voltage.
     near(time_s(60, 0.05).unwrap().mean, 3600.0 * (1.0 - 0.05 * 0.08 / 1.2 / 2.0) / 0.05, 0.01);
 }
 
@@ -218,7 +219,8 @@ fn recent_load_contains_changing_current_without_mode() {
     near(found.mean_a, 1.0, 0.02);
     near(found.mean_square_a2, 17.0, 0.02);
     assert!(found.peak_a > 4.9);
-    // A load that moves hardly any charge foretells nothing. Noise before the first mode is no load.
+    // A load that moves hardly any net charge does not count as known. Noise before the first mode does not count as
+    // load.
     let mut balanced = RecentLoad::default();
     for second in 0..600 {
         let current_a = if second % 2 == 0 { 5.0 } else { -4.8 };
@@ -228,12 +230,12 @@ fn recent_load_contains_changing_current_without_mode() {
     let mut noise = RecentLoad::default();
     (0..9).for_each(|n| noise.observe(Timestamp::from_secs(f64::from(n)), Mode::Unknown, Some(0.02), 0.05));
     assert_eq!(noise.discharge.load(), None);
-    // The first current after a sleep says nothing about the sleep.
+    // The first current after a sleep is not averaged over the sleep.
     let before = load;
     load.interrupt();
     load.observe(Timestamp::from_secs(640.0), Mode::Unknown, Some(100.0), 0.05);
     assert_eq!(load.discharge, before.discharge);
-    // Rest is no load, and a gap is not averaged.
+    // Rest does not count as load, and a gap is not averaged.
     load.observe(Timestamp::from_secs(5000.0), Mode::Rest, Some(0.01), 0.05);
     load.observe(Timestamp::from_secs(5001.0), Mode::Rest, Some(0.01), 0.05);
     assert_eq!(load.discharge.load(), Some(found));

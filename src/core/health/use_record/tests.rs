@@ -34,7 +34,7 @@ impl Bench {
         bench
     }
 
-    /// Observes the sample every 0.1 s for this time.
+    /// Observes the sample every 0.1 s for `seconds`.
     fn run(&mut self, seconds: u32, sample: &UseSample) -> UseRecord {
         for _ in 0..10 * seconds {
             self.tenth += 1;
@@ -154,12 +154,12 @@ fn rest_at_high_soc_includes_gaps_only_if_parked() {
         [known_s, above_80_s, above_90_s, unknown_s]
     };
     close(rest(10, &full, 3600), [10.0, 10.0, 10.0, 0.0]);
-    // The first SOC after the gap arrives later. The lower SOC counts.
+    // The first SOC after the gap arrives later. For the gap, the lower of the two SOC values counts.
     close(rest(1, &UseSample::default(), 0), [10.0, 10.0, 10.0, 0.9]);
     let parked = UseSample { soc: Some(0.9), ..REST };
     close(rest(10, &parked, 3600), [3620.1, 3620.1, 10.0, 0.9]);
     close(rest(10, &UseSample { soc: Some(0.7), ..REST }, 0), [3630.0, 3620.1, 10.0, 0.9]);
-    // A gap after a load is not parking.
+    // A gap after a load does not count as rest.
     rest(1, &driven, 3600);
     close(rest(10, &full, 0), [3639.9, 3630.0, 19.9, 0.9]);
 }
@@ -175,7 +175,7 @@ fn gaps_do_not_count_as_time_beyond_limits() {
     bench.skip(1000);
     let record = bench.run(10, &hot);
     close([record.temperature_c.above.beyond_s, record.rest.above_90_s], [29.8, 1029.9]);
-    // The clock of another run.
+    // The counter moves to the clock of another run.
     bench.counter.rebase(-3_000_000_000);
     bench.counter.observe(Timestamp::default(), &LIMITS, &hot);
     close([bench.counter.record().temperature_c.above.beyond_s], [29.8]);

@@ -6,8 +6,8 @@
 //! severity are still configured. Estimates therefore change only if their settings change.
 //!
 //! If the recharge window changes, the measured recharge periods become unknown, unless they can be converted exactly.
-//! If the load of the usable capacity changes, the usable capacity becomes unknown. Initial values only affect cells
-//! about which nothing is known. Changed initial values therefore apply when the next pack is connected.
+//! If the load of the usable capacity changes, the usable capacity becomes unknown. Initial values affect only cells
+//! without learned values, so changed initial values apply when the next pack is connected.
 
 use crate::alarm::{Observation, Rule};
 use crate::health::HealthConfig;
@@ -18,8 +18,8 @@ use crate::monitor::stage::publisher::Publisher;
 use crate::quantity::Timestamp;
 
 impl Monitor {
-    /// Applies a new configuration between two inputs. `now` is the time of the request. The event has this time, or
-    /// the clock's time if that is later. The clock does not advance.
+    /// Applies a new configuration between two inputs. `now` is the time of the request. The event about the change has
+    /// this time or the clock's time, whichever is later. The clock does not advance.
     ///
     /// # Errors
     /// The first setting that needs a restart. The monitor is then unchanged.

@@ -1,7 +1,7 @@
 //! Restores learned values of the cells from a history, for use if the state of the last run is lost.
 //!
 //! In: capacities (Ah) and resistances (relative to a new cell) of cells, for a monitor that has not received an input.
-//! Out: a monitor that knows only these values.
+//! Out: a monitor that has learned only these values.
 
 use crate::filter::ScalarGaussian;
 use crate::health::CapacityMethod;
@@ -10,8 +10,8 @@ use crate::monitor::message::LearnedCell;
 use crate::monitor::stages::Stages;
 
 impl Monitor {
-    /// Sets the learned values of the cells. If a cell does not exist or a number is impossible, the history does not
-    /// fit this pack: returns `false` and changes nothing.
+    /// Sets the learned values of the cells. If a cell does not exist or a number is impossible, returns `false` and
+    /// changes nothing, because the history does not fit this pack.
     pub fn relearn(&mut self, learned: &[LearnedCell]) -> bool {
         let Stages { estimation, learning, .. } = &mut self.stages;
         let is_valid =

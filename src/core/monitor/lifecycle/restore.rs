@@ -15,8 +15,8 @@ use crate::monitor::stages::Stages;
 use crate::monitor::stages::pack_memory::{StoredCell, StoredPack};
 use crate::quantity::Timestamp;
 
-/// Longest time without an input while a program runs (s); a running program sends ticks. A longer gap is a restart,
-/// even if the timestamps are on the same clock.
+/// Longest time without an input while a program runs and sends ticks (s). A longer gap is a restart, even if the
+/// timestamps are on the same clock.
 const BREAK_S: f64 = 30.0;
 
 impl Monitor {
@@ -52,9 +52,9 @@ impl Monitor {
     /// snapshot was taken `downtime` before that time. The snapshot's timestamps are shifted to the clock of the
     /// present run, and the downtime counts as a gap.
     ///
-    /// [`Downtime::AsStamped`] means that the same clock continues. Frames, events and estimates are then equal, byte
-    /// for byte, to the outputs of a monitor that had not stopped. This does not apply if the downtime exceeds half a
-    /// minute, or if the state was stored [for a restart](Snapshot::for_restart).
+    /// With [`Downtime::AsStamped`], the same clock continues. Frames, events and estimates are then equal, byte for
+    /// byte, to the outputs of a monitor that had not stopped. They differ if the downtime exceeds half a minute, or if
+    /// the state was stored [for a restart](Snapshot::for_restart).
     ///
     /// # Errors
     /// The snapshot's version, cells or branches do not fit, or a number in the snapshot is impossible. The monitor
@@ -132,7 +132,6 @@ impl Stages {
         }
     }
 
-    /// Restores a checked and rebased snapshot.
     fn restore(&mut self, snapshot: Snapshot, now: Timestamp, out: &mut Outputs) {
         let is_continued = snapshot.may_continue;
         let has_reported = snapshot.cells.iter().map(|cell| cell.updated_in_round).collect();
@@ -167,7 +166,6 @@ impl Stages {
         self.statistics.restores = self.statistics.restores.saturating_add(1);
     }
 
-    /// Restores the cells' model, and the filters and learned values of all cells.
     fn restore_learned(
         &mut self,
         cells: &[StoredCell],
@@ -247,7 +245,8 @@ impl Stages {
         self.publisher(now, out).publish_alarms();
     }
 
-    /// Restores the alarms stored at `stored`; `None` = the same run continues. Alarms without a configured threshold end, and receivers on the bus are notified.
+    /// Restores the alarms that were stored at `stored`; `None` = the same run continues. Alarms without a configured
+    /// threshold end, and receivers on the bus are notified.
     fn restore_alarms(&mut self, time: Timestamp, state: &AlarmSnapshot, stored: Option<Timestamp>, out: &mut Outputs) {
         self.alarming.state.knows_all_valid = false;
         let orphans = self.alarming.engine.restore(time, state);

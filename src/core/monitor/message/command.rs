@@ -22,7 +22,6 @@ pub enum Command {
     },
     /// Send a rule's alarm frame, marked as a test, for a while.
     Test {
-        /// The rule.
         rule: Rule,
         /// Duration (s).
         seconds: f64,

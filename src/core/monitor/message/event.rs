@@ -32,11 +32,9 @@ pub enum EventKind {
         /// The mode that began.
         to: Mode,
     },
-    /// One half-cycle of one cell is complete.
+    /// A half-cycle (a charge or a discharge) of a cell is complete.
     HalfCycle {
-        /// Index of the cell.
         cell: CellIndex,
-        /// Charge or discharge.
         mode: Mode,
         /// Charge moved (Ah), positive.
         charge_ah: f64,
@@ -54,7 +52,6 @@ pub enum EventKind {
     },
     /// The capacity estimate of a cell was updated after a half-cycle.
     Capacity {
-        /// Index of the cell.
         cell: CellIndex,
         /// Capacity measured by this half-cycle alone (Ah); `None` if the half-cycle contains no usable information.
         measured_ah: Option<f64>,
@@ -64,10 +61,9 @@ pub enum EventKind {
         #[serde(flatten)]
         values: RecordedValues,
     },
-    /// Losses of a cell after a half-cycle, as fractions of the model's new cell. Not sent before the cell's capacity
-    /// has been measured.
+    /// Lithium and active material that a cell has lost, as fractions of the model's new cell. Sent after a half-cycle,
+    /// once the cell's capacity has been measured.
     LossModes {
-        /// Index of the cell.
         cell: CellIndex,
         /// Loss of lithium inventory.
         lli: f64,
@@ -82,10 +78,9 @@ pub enum EventKind {
         /// Standard deviation of the positive electrode's loss.
         lam_pe_std: f64,
     },
-    /// Shortest remaining life of all cells, after a half-cycle. Sent while this remaining life is known, and once
-    /// without values when it becomes unknown.
+    /// Shortest remaining life of all cells. Sent after a half-cycle while this life is known, and once without values
+    /// when it becomes unknown.
     RemainingLife {
-        /// Index of the cell.
         cell: Option<CellIndex>,
         /// Equivalent full cycles until the capacity falls to its end-of-life value, median.
         cycles: Option<f64>,
@@ -106,9 +101,9 @@ pub enum EventKind {
         #[serde(flatten)]
         values: RecordedPackValues,
     },
-    /// A charge that covered the recharge window, or enough of it, has ended.
+    /// A charge that covered the recharge window (a configured SOC range), or enough of it, has ended.
     RechargePeriod {
-        /// Time between the two configured SOC values (s); `None` if the charge did not cover the whole window without
+        /// Time between the two ends of the window (s); `None` if the charge did not cover the whole window without
         /// interruption.
         seconds: Option<f64>,
         /// Time that the reference charger would need (s); `None` if the capacity of a cell has not been learned, or if
@@ -119,23 +114,19 @@ pub enum EventKind {
     },
     /// An alarm changed.
     Alarm {
-        /// The rule.
         rule: Rule,
         /// Index of the cell; `None` = the pack.
         cell: Option<CellIndex>,
-        /// The change.
         change: Change,
         /// State of the alarm after the change.
         state: AlarmState,
         /// Whether the alarm is raised now.
         active: bool,
-        /// Severity of the alarm.
         severity: Severity,
         /// The value that the rule compares with the threshold; `None` = unknown.
         value: Option<f64>,
         /// Probability that the true value is beyond the threshold; `None` if the value has no standard deviation.
         probability: Option<f64>,
-        /// The threshold.
         threshold: f64,
         /// Number of times the alarm was raised.
         occurrences: u32,
@@ -144,9 +135,7 @@ pub enum EventKind {
     },
     /// A command was executed.
     Command {
-        /// Origin of the command.
         source: Source,
-        /// The command.
         #[serde(rename = "request")]
         command: Command,
         /// Number of changed alarms.
@@ -159,14 +148,13 @@ pub enum EventKind {
     BadCommand {
         /// Interface that received the frame.
         bus: BusIndex,
-        /// Whether the frame's checksum, or its authenticator and freshness, were right.
+        /// Whether the frame is intact: its checksum is right, or its authenticator and freshness are right.
         intact: bool,
         /// Reason for the rejection.
         reason: CommandRefusal,
     },
     /// A test of a rule's alarm frame started or ended.
     Test {
-        /// The rule.
         rule: Rule,
         /// Whether the test started.
         running: bool,
@@ -194,9 +182,7 @@ pub enum EventKind {
     },
     /// A stored alarm ended because the configuration no longer has a threshold for it.
     AlarmDropped {
-        /// The rule.
         rule: Rule,
-        /// Severity of the alarm.
         severity: Severity,
         /// Index of the cell; `None` = the pack.
         cell: Option<CellIndex>,
@@ -224,14 +210,12 @@ pub enum EventKind {
     },
     /// A signal turned good again.
     SignalGood {
-        /// The signal.
         channel: Channel,
         /// Number of bad readings since the signal turned bad.
         bad_readings: u64,
     },
-    /// A protected message started to fail the end-to-end check, or became usable again. Further results are only
-    /// counted. The result of the first frame is not reported as a change. Lost frames are reported only if more frames
-    /// are lost than the check allows.
+    /// A protected message started to fail the end-to-end check, or became usable again. The result of the first frame
+    /// is not reported. Lost frames are reported only if more frames are lost than the check allows.
     Protection(GuardChange),
     /// A message started or stopped exceeding its frame limit.
     Flood(FloodChange),
@@ -272,7 +256,7 @@ pub enum EventKind {
         /// Size of the step back (s).
         seconds: f64,
     },
-    /// The cells' model was learned from the vehicle's data, the previous model is used again, or the data fit another
+    /// The cell model was learned from the vehicle's data, the previous model is used again, or the data fit another
     /// chemistry better.
     Model {
         /// State of the model after the change.
@@ -297,7 +281,6 @@ pub enum EventKind {
     },
     /// A cell's estimate became trusted or untrusted.
     Trust {
-        /// Index of the cell.
         cell: CellIndex,
         /// Whether the estimate is trusted: `mean_nis` is at most the consistency limit.
         trusted: bool,
@@ -319,7 +302,7 @@ impl EventKind {
     }
 }
 
-/// State of the cells' model.
+/// State of the cell model.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ModelState {
@@ -353,7 +336,6 @@ impl ModelState {
 pub struct Event {
     /// Time of the input that caused the event.
     pub time: Timestamp,
-    /// Kind of the event, with its data.
     #[serde(flatten)]
     pub kind: EventKind,
 }

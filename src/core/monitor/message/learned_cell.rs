@@ -3,10 +3,9 @@
 use crate::filter::ScalarGaussian;
 use crate::quantity::CellIndex;
 
-/// Learned values of one cell from a history.
+/// Learned values of one cell.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LearnedCell {
-    /// The cell.
     pub cell: CellIndex,
     /// Capacity (Ah).
     pub capacity: ScalarGaussian,

@@ -13,12 +13,10 @@ use crate::quantity::{BusIndex, CellIndex, Timestamp};
 pub struct Transmit {
     /// Time of the input that caused the frame.
     pub time: Timestamp,
-    /// Interface to send on.
     pub bus: BusIndex,
-    /// The frame.
     pub frame: Frame,
-    /// Whether the frame announces a learned value or an alarm change. True for all health, alarm and J1939 frames, so
-    /// that all frames of one identifier and all parts of one transfer have the same flag.
+    /// Whether the frame announces a learned value or an alarm change. True for all health, alarm and J1939 frames. All
+    /// frames of one identifier and all parts of one transfer therefore have the same flag.
     pub announces: bool,
     /// How to authenticate the frame; `None` = the frame is not authenticated. The frame already contains its
     /// freshness, and zeros in place of the authenticator.
@@ -35,7 +33,7 @@ pub struct Secured {
 }
 
 impl Secured {
-    /// Writes the authenticator into a copy of the frame; `mac` is AES-128-CMAC.
+    /// Returns a copy of the frame that contains the authenticator. `mac` computes AES-128-CMAC.
     pub fn seal(&self, frame: &Frame, mac: impl FnOnce(&[u8]) -> Mac) -> Frame {
         let mut sealed = *frame;
         if let Some(input) = self.authentication.mac_input(frame.data(), self.freshness) {
@@ -66,7 +64,6 @@ pub enum Validity {
 pub struct Estimate {
     /// Time of the voltage reading.
     pub time: Timestamp,
-    /// Index of the cell.
     pub cell: CellIndex,
     /// State of charge, fraction.
     pub soc: f64,
@@ -95,20 +92,16 @@ pub struct Estimate {
 /// Readings used for one estimate.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MeasuredValues {
-    /// Voltage (V).
     pub voltage_v: f64,
     /// Cell current (A), positive = discharge.
     pub current_a: f64,
-    /// Temperature (degrees C).
     pub temperature_c: f64,
 }
 
 /// Outputs of the monitor. The caller empties and reuses one value, so that normal operation does not allocate memory.
 #[derive(Debug, Default)]
 pub struct Outputs {
-    /// Frames to send.
     pub frames: Vec<Transmit>,
-    /// Events to log.
     pub events: Vec<Event>,
     /// Estimates; empty unless `want_estimates` is set.
     pub estimates: Vec<Estimate>,

@@ -10,13 +10,11 @@ use crate::quantity::{BusIndex, Timestamp};
 /// Something that happened, with the time on the driver's clock. Logs and journals hold records; the core handles them.
 ///
 /// Records arrive in the order in which they happened. A time up to [`MERGE_TOLERANCE_NS`] before the latest time is
-/// possible, because records of several buses may be merged out of order. Such a time is counted and treated as the
-/// latest time. A time further back means that the clock was set back, so the elapsed time is unknown.
+/// possible, because the records of several buses may be merged out of order. The core counts such a record and handles
+/// it at the latest time. A time further back means that the clock was set back, so the elapsed time is unknown.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Record {
-    /// Time on the driver's clock.
     pub time: Timestamp,
-    /// Kind of the record.
     pub kind: RecordKind,
 }
 
@@ -27,17 +25,14 @@ pub enum RecordKind {
     Frame {
         /// Interface that received the frame.
         bus: BusIndex,
-        /// The frame.
         frame: Frame,
     },
     /// A frame of an authenticated message was received and its authenticator was checked
     /// ([`Monitor::mac_check`](crate::monitor::Monitor::mac_check)).
     SecuredFrame {
-        /// Interface that received the frame.
         bus: BusIndex,
-        /// The frame.
         frame: Frame,
-        /// The freshness value that the authenticator confirms; `None` = no value fits.
+        /// The freshness value for which the authenticator is correct; `None` if there is no such value.
         freshness: Option<u64>,
     },
     /// Time passed. The driver sends a tick every [`TICK_PERIOD_MS`] while the computer is awake. Cyclic frames and

@@ -13,7 +13,6 @@ use crate::quantity::{CellIndex, Mode};
 /// Present values of one cell.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct CellView {
-    /// Index of the cell.
     pub cell: CellIndex,
     /// Values of the cell. Measured values are known while their readings are fresh. State of charge and resistance are
     /// known while the voltage is fresh. Learned values are known after the first half-cycle that measured the
@@ -27,16 +26,14 @@ pub struct CellView {
     pub trusted: Option<bool>,
 }
 
-/// Present values of the pack, from its limiting cells.
+/// Present values of the pack.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct PackView {
-    /// Validity of the estimates.
     pub validity: Validity,
-    /// Charge, rest or discharge.
     pub mode: Mode,
     /// The cell that is empty first.
     pub limiting_cell: Option<CellIndex>,
-    /// The cells that limit the power of a discharge and of a charge for 10 s.
+    /// The cell that limits the 10 s discharge power, and the cell that limits the 10 s charge power.
     #[serde(default)]
     pub power_limiting_cells: Option<[CellIndex; 2]>,
     /// The cell with the lowest capacity, once every cell's capacity has been learned.
@@ -44,19 +41,18 @@ pub struct PackView {
     /// The cell with the shortest remaining life, once every cell's remaining life is known.
     #[serde(default)]
     pub shortest_lived_cell: Option<CellIndex>,
-    /// State of the cells' model; `None` in documents of earlier versions.
+    /// State of the cell model; `None` in documents of earlier versions.
     #[serde(default)]
     pub model_state: Option<ModelState>,
     /// The chemistry that explains the voltages better than the label's chemistry.
     #[serde(default)]
     pub model_fits_better: Option<Chemistry>,
-    /// Charge and energy moved while the program ran with this pack; `None` in documents of earlier versions.
+    /// Charge and energy that moved through the pack while the program ran; `None` in documents of earlier versions.
     #[serde(default)]
     pub moved: Option<MovedSums>,
-    /// How the pack was used while the program ran with it; `None` in documents of earlier versions.
+    /// Counters of how the pack was used while the program ran; `None` in documents of earlier versions.
     #[serde(default)]
     pub use_record: Option<UseRecord>,
-    /// Values of the pack.
     #[serde(flatten)]
     pub values: PackValues,
 }

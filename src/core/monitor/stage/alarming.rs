@@ -12,11 +12,10 @@ use crate::quantity::{CellIndex, Timestamp};
 /// Period for refreshing displayed values that change no alarm (s).
 const SHOW_S: f64 = 1.0;
 
-/// The alarming stage.
 #[derive(Debug)]
 pub(crate) struct Alarming {
     pub(crate) engine: AlarmEngine,
-    /// Shortest silence after which a configured threshold reports an input as missing (s); `None` without such a rule.
+    /// Shortest silence that a configured threshold reports as a missing input (s); `None` without such a rule.
     pub(crate) missing_after_s: Option<f64>,
     /// Changes that wait to be published.
     pub(crate) changes: Vec<AlarmChange>,
@@ -26,7 +25,6 @@ pub(crate) struct Alarming {
     pub(crate) state: AlarmingState,
 }
 
-/// State that the comparison of values with the rules needs.
 #[derive(Debug, Clone, Copy, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct AlarmingState {
@@ -34,12 +32,11 @@ pub(crate) struct AlarmingState {
     pub(crate) inputs_shown_at: Option<Timestamp>,
     /// Time of the last refresh of displayed innovations that change no alarm.
     pub(crate) innovations_shown_at: Option<Timestamp>,
-    /// Whether the engine knows that every learned value has valid inputs.
+    /// Whether every learned value is marked in the engine as having valid inputs.
     pub(crate) knows_all_valid: bool,
     pub(crate) store: StoreHealth,
 }
 
-/// Stored state of the stage.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct StoredAlarming {
@@ -74,7 +71,6 @@ impl Alarming {
         rule.depends_on_cell_voltage() && cell.is_some_and(|cell| self.faulty_channels.contains(&cell))
     }
 
-    /// The state to be stored.
     pub(crate) fn snapshot(&self) -> StoredAlarming {
         StoredAlarming { alarms: self.engine.snapshot(), running: self.engine.running(), state: self.state }
     }

@@ -28,30 +28,26 @@ use crate::sample::CellSample;
 /// enough to trip an alarm whose threshold is the limit.
 const DOUBT: f64 = 2.0;
 
-/// A cell is trusted again once its contradiction has fallen to this part of the consistency limit. With the default
-/// limit, this is the mean of a correct filter.
+/// If a cell is not trusted, its contradiction must fall to this part of the consistency limit before the cell is
+/// trusted again. With the default limit, a correct filter has this contradiction on average.
 const RETURN: f64 = 0.25;
 
-/// Value of `Consumed::path_v` for a frozen voltage (V). It is far outside the range of [`CurrentCheck::path_v`].
+/// Value of `Consumed::path_v` that marks a frozen voltage (V), far outside the range of [`CurrentCheck::path_v`].
 const FROZEN_PATH_V: f64 = 1e9;
 
-/// The estimation stage.
 #[derive(Debug)]
 pub(crate) struct Estimation {
     pub(crate) bank: PackBank,
     /// Modules with cells of another kind.
     modules: Vec<CellModule>,
     pub(crate) batch: CellBatch,
-    /// Per cell: which samples its steps have used.
     progress: Vec<CellProgress>,
     /// Per cell: whether its estimate is trusted ([`Self::judge_trust`]).
     trusted: Vec<bool>,
     pub(crate) all_trusted: bool,
-    /// Per cell: the check of its model.
     checks: Vec<ModelCheck>,
     any_check_open: bool,
     pub(crate) any_mismatched: bool,
-    /// Compares the changes of the current with the changes of the voltages.
     pub(crate) current_check: CurrentCheck,
     /// Whether the current's reading is frozen or contradicts the voltages, or an input message has a second sender.
     pub(crate) is_current_doubtful: bool,
@@ -66,17 +62,14 @@ pub(crate) struct Estimation {
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct EstimationState {
-    /// Samples that wait for their filter step.
     pub(crate) waiting: Vec<CellSample>,
-    /// Whether the current's reading is frozen or contradicts the voltages, or an input message has a second sender.
     pub(crate) is_current_doubtful: bool,
-    /// Whether the current was doubtful at any time since the last change of mode.
     pub(crate) was_current_doubtful: bool,
     pub(crate) current_check: CurrentCheck,
 }
 
-/// Which samples the steps of a cell have used. Stored apart from the filters for cache locality, because every sample
-/// updates this data.
+/// What a cell's filter has used so far. Stored apart from the filters for cache locality, because every sample updates
+/// this data.
 #[derive(Debug, Clone, Copy, Default)]
 struct CellProgress {
     /// Sampler totals at the last step; `None` before the first step.
@@ -92,9 +85,8 @@ pub(crate) struct Consumed {
     pub(crate) charge_as: f64,
     offset_s: f64,
     pub(crate) unmeasured_s: f64,
-    /// The latest voltage (V).
     voltage_v: f64,
-    /// The sum of the cells' common changes ([`CurrentCheck::path_v`]) when this voltage last changed (V).
+    /// Value of [`CurrentCheck::path_v`] when this voltage last changed (V).
     path_v: f64,
 }
 
@@ -120,7 +112,6 @@ impl Estimation {
         }
     }
 
-    /// Applies the settings of a new configuration that has the same cells.
     pub(crate) fn reconfigure(&mut self, config: &MonitorConfig, modelling: &Modelling, learner: &Learner) {
         self.modules.clone_from(&config.modules);
         self.use_model(modelling, learner);
@@ -166,8 +157,7 @@ impl Estimation {
         self.note_checks();
     }
 
-    /// Whether the current is doubtful, or the SOC has jumped and no explained step of the current has confirmed it
-    /// since.
+    /// Whether the current is doubtful, or a jump of the SOC is unconfirmed ([`CurrentCheck::is_unconfirmed`]).
     pub(crate) fn is_doubtful(&self) -> bool {
         self.is_current_doubtful || self.current_check.is_unconfirmed()
     }
@@ -182,17 +172,15 @@ impl Estimation {
         self.ambient_c
     }
 
-    /// Number of cells.
     pub(crate) fn cells(&self) -> usize {
         self.progress.len()
     }
 
-    /// Indexes of all cells.
     pub(crate) fn cell_indices(&self) -> impl ExactSizeIterator<Item = CellIndex> + use<> {
         (0..u16::try_from(self.cells()).unwrap_or(u16::MAX)).map(CellIndex)
     }
 
-    /// Steps the filters of all waiting samples. Returns the samples, which the caller later passes to
+    /// Runs the filters on all waiting samples. Returns the samples, which the caller later passes to
     /// [`finish`](Self::finish).
     pub(crate) fn step(&mut self, learner: &mut Learner, modelling: &mut Modelling) -> Vec<CellSample> {
         let samples = std::mem::take(&mut self.batch.waiting);
@@ -207,8 +195,8 @@ impl Estimation {
             self.bank.add(cell, &step);
         }
         self.bank.step();
-        // A wrong current makes most cells jump. A small current that is not exactly zero shows that the sensor works
-        // and the pack rests.
+        // A wrong current makes the SOC of most cells jump. Jumps at rest do not count. A small current that is not
+        // exactly zero shows that the sensor works and the pack rests.
         let rest_a = self.bank.own_config().gap.rest_current_a;
         let is_rest = |sample: &CellSample| sample.current_a.is_some_and(|a| a != 0.0 && a.abs() <= rest_a);
         let has_jumped = |sample: &&CellSample| self.bank.result(sample.cell.index()).jumped && !is_rest(sample);
@@ -220,7 +208,6 @@ impl Estimation {
         samples
     }
 
-    /// Compares the changes of the current with the changes of the voltages.
     fn check_current(&mut self, samples: &[CellSample]) {
         let Self { bank, current_check, .. } = self;
         let own = bank.own_cells();
@@ -237,12 +224,12 @@ impl Estimation {
         current_check.handle(compared, config.voltage.noise_v, ohm, config.gap.rest_current_a);
     }
 
-    /// Mean SOC of the pack's own kind of cells, fraction; 0.5 if no such cell has an estimate.
+    /// Mean SOC of the cells outside modules, fraction; 0.5 if no such cell has an estimate.
     fn mean_soc(&self) -> f64 {
         self.mean_estimate().map_or(0.5, |soc| soc.mean)
     }
 
-    /// Adopts another model. The cells keep their differences from the mean of the cells.
+    /// Adopts another model. Each cell keeps its differences from the mean cell in SOC, resistance and capacity.
     pub(crate) fn adopt(&mut self, adoption: &Adoption, learner: &mut Learner, config: &CapacityConfig) {
         let Adoption { model, config: estimator, mean, with_capacity, is_learned } = adoption;
         let (own, bank) = (self.bank.own_cells().to_vec(), &self.bank);
@@ -272,17 +259,17 @@ impl Estimation {
         self.note_checks();
     }
 
-    /// SOC of a cell at a mark: in the filter, and by voltage ([`Self::soc_by_voltage`]). `is_label`: whether the pack's
-    /// own kind of cells has the model of a label.
+    /// SOC of a cell at a mark (a possible start of a half-cycle): the filter's SOC, and the [SOC by
+    /// voltage](Self::soc_by_voltage). `is_label`: whether the model of the cells outside modules comes from a label.
     pub(crate) fn soc_at_mark(&self, cell: usize, is_label: bool) -> (Option<ScalarGaussian>, Option<f64>) {
         let uses_label = if self.bank.is_own(cell) { is_label } else { !self.bank.has_given_model(cell) };
         let by_voltage = if uses_label { self.soc_by_voltage(cell) } else { None };
         (self.bank.filtered_soc(cell), by_voltage)
     }
 
-    /// SOC at which the open-circuit curve has a cell's latest voltage, corrected by the drop in the cell. Unlike the
-    /// SOC in the filter, it does not contain the counted charge. `None` if the current is unknown or doubtful, if the
-    /// voltage is frozen, or if the SOC is outside the curve.
+    /// SOC at which the open-circuit voltage equals a cell's latest voltage plus the voltage drop in the cell. Unlike
+    /// the filter's SOC, this SOC does not contain the counted charge. `None` if the current is unknown or doubtful, if
+    /// the voltage is frozen, or if the SOC is outside the curve.
     fn soc_by_voltage(&self, index: usize) -> Option<f64> {
         let sample = self.progress[index].sample?;
         let current_a = sample.current_a.filter(|_| !self.is_current_doubtful && !self.is_voltage_frozen(index))?;
@@ -297,7 +284,7 @@ impl Estimation {
         (-0.05..=1.05).contains(&soc).then_some(soc)
     }
 
-    /// Completes the work on stepped samples, and reuses their buffer.
+    /// Completes the work on samples that the filters have used, and reuses their buffer.
     pub(crate) fn finish(&mut self, mut samples: Vec<CellSample>, is_label: bool, learner: &mut Learner) {
         samples.clear();
         self.batch.waiting = samples;
@@ -376,12 +363,10 @@ impl Estimation {
         self.bank.result(sample.cell.index()).reset
     }
 
-    /// Whether a cell's estimate is trusted.
     pub(crate) fn is_trusted(&self, index: usize) -> bool {
         self.trusted[index]
     }
 
-    /// Judges the models of the cells whose model check is due.
     fn check_models(&mut self, samples: &[CellSample]) {
         if !self.any_check_open {
             return;
@@ -412,18 +397,17 @@ impl Estimation {
         self.any_mismatched = self.checks.iter().any(ModelCheck::is_mismatched);
     }
 
-    /// Whether a cell belongs to a module and its stored `check` was made with another cell model than the present
-    /// model.
+    /// Whether a cell belongs to a module and its stored `check` was made with a different cell model.
     pub(crate) fn is_other_cell(&self, index: usize, check: &ModelCheck) -> bool {
         !self.bank.is_own(index) && self.is_of_other_model(index, check)
     }
 
-    /// Whether the stored `check` of a cell was made with another model than the present model.
+    /// Whether the stored `check` of a cell was made with a different cell model.
     pub(crate) fn is_of_other_model(&self, index: usize, check: &ModelCheck) -> bool {
         check.is_of_other(model_id(self.bank.model(index), self.bank.config(index).initial.log_resistance_std))
     }
 
-    /// Mean SOC and mean SOC variance of the pack's own kind of cells; `None` if no such cell has an estimate.
+    /// Mean SOC and mean SOC variance of the cells outside modules; `None` if no such cell has an estimate.
     pub(crate) fn mean_estimate(&self) -> Option<ScalarGaussian> {
         let socs = self.bank.own_cells().iter().filter_map(|&cell| self.bank.filtered_soc(cell));
         let (count, mean, variance) = socs.fold((0.0, 0.0, 0.0), |(count, mean, variance), soc| {
@@ -432,7 +416,6 @@ impl Estimation {
         (count > 0.0).then(|| ScalarGaussian { mean: mean / count, variance: variance / count })
     }
 
-    /// The check of a cell's model, to be stored.
     pub(crate) fn model_check(&self, index: usize) -> ModelCheck {
         self.checks[index]
     }
@@ -496,17 +479,14 @@ impl Estimation {
         })
     }
 
-    /// Resistance of a cell relative to a new cell.
     pub(crate) fn resistance(&self, index: usize) -> ScalarGaussian {
         resistance(&self.bank, index)
     }
 
-    /// Sampler totals at a cell's latest step, to be stored.
     pub(crate) fn consumed(&self, cell: usize) -> Option<Consumed> {
         self.progress[cell].consumed
     }
 
-    /// The state to be stored, without the cells.
     pub(crate) fn snapshot(&self) -> EstimationState {
         EstimationState {
             waiting: self.batch.waiting.clone(),

@@ -1,9 +1,9 @@
 //! Findings stage: detects faults of cells and sensors from cell samples.
 //!
-//! In: the samples of all cells with their estimates. Out: an event for each new finding ([`EventKind::Finding`]). The
-//! stage only observes: estimates and capacities do not depend on findings. When a row of the detector (a few minutes
-//! of samples) ends, the results of the row go to the alarm rules about single cells. If the rule `thermal_event` is
-//! configured, the stage also watches the readings for a thermal event.
+//! In: the samples of all cells with their estimates. Out: an event for each new finding ([`EventKind::Finding`]).
+//! Estimates and capacities do not depend on findings. When a row of the detector (a few minutes of samples) ends, its
+//! results go to the alarm rules about single cells. If the rule `thermal_event` is configured, the stage also checks
+//! the readings for a thermal event.
 
 use super::estimation::Estimation;
 use super::learning::Learning;
@@ -19,13 +19,11 @@ use crate::monitor::message::{Event, EventKind, Outputs};
 use crate::quantity::{CellIndex, Channel, Fault, Reading, Timestamp};
 use crate::sample::CellSample;
 
-/// The findings stage.
 #[derive(Debug)]
 pub(crate) struct Findings {
     pub(crate) diagnosis: CellFaultDetector,
     cells: usize,
-    /// The cells that the detector compares with each other: all cells of the pack's own kind. The cells in modules of
-    /// another kind are excluded.
+    /// Cells that the detector compares with each other: all cells except those in modules of another kind.
     compared: Vec<usize>,
     /// Whether the BMS discharges fuller cells after a charge (passive balancing).
     is_balanced: bool,
@@ -36,7 +34,7 @@ pub(crate) struct Findings {
 }
 
 impl Findings {
-    /// Creates the stage. `compared`: the cells of the pack's own kind.
+    /// `compared`: all cells except those in modules of another kind.
     pub(crate) fn new(config: &MonitorConfig, compared: &[usize]) -> Self {
         let cells = usize::from(config.sample.cells);
         let (is_balanced, balancing) = (config.is_balanced, config.balancing);
@@ -45,30 +43,27 @@ impl Findings {
         Self { diagnosis, cells, compared, is_balanced, balancing, thermal }
     }
 
-    /// Applies the settings of a new configuration that has the same cells.
     pub(crate) fn reconfigure(&mut self, config: &MonitorConfig) {
         (self.is_balanced, self.balancing) = (config.is_balanced, config.balancing);
         let new = thermal_watch(config);
         self.thermal = new.map(|new| self.thermal.take().unwrap_or(new));
     }
 
-    /// Forgets everything, because another pack is connected.
     pub(crate) fn forget(&mut self) {
         self.diagnosis = CellFaultDetector::among(self.cells, &self.compared);
         self.interrupt_thermal();
     }
 
-    /// Handles a break in the readings: a rise or fall across the break is no thermal event.
+    /// Handles a break in the readings. A rise or fall across the break does not count as a thermal event.
     pub(crate) fn interrupt_thermal(&mut self) {
         self.thermal.iter_mut().for_each(ThermalWatch::interrupt);
     }
 
-    /// State of the watch for a thermal event, to be stored.
     pub(crate) fn stored_thermal(&self) -> Option<ThermalWatch> {
         self.thermal.clone()
     }
 
-    /// Restores a checked watch, unless the configuration has changed.
+    /// Restores a stored watch that has been checked. If the configuration has changed, the stored watch is ignored.
     pub(crate) fn restore_thermal(&mut self, stored: Option<ThermalWatch>) {
         if let (Some(thermal), Some(stored)) = (&mut self.thermal, stored)
             && stored.fits(thermal)
@@ -77,8 +72,8 @@ impl Findings {
         }
     }
 
-    /// Watches a reading, plausible or not, for a thermal event. Returns the cell and its evidence if the evidence is
-    /// new.
+    /// Checks a reading for a thermal event, before its plausibility check. Returns the cell and its evidence if the
+    /// evidence is new.
     #[inline]
     pub(crate) fn watch_reading(
         &mut self,
@@ -104,7 +99,8 @@ impl Findings {
         Some((cell, thermal.evidence_of(now, cell)))
     }
 
-    /// Refreshes the watch for a thermal event if this is due. If so, returns the evidence for each cell.
+    /// Updates the evidence for a thermal event. Returns the evidence of each cell, or an empty list if no update is
+    /// due.
     pub(crate) fn refresh_thermal(
         &mut self,
         now: Timestamp,
@@ -136,13 +132,11 @@ impl Findings {
         }
     }
 
-    /// The cells whose channel is faulty.
     pub(crate) fn faulty_channels(&self) -> Vec<CellIndex> {
         let is_faulty = |cell: &CellIndex| self.diagnosis.has_channel_fault(*cell) == Some(true);
         (0..).map(CellIndex).take(self.cells).filter(is_faulty).collect()
     }
 
-    /// Handles a balancing bit of a cell.
     pub(crate) fn handle_balancing(&mut self, now: Timestamp, cell: CellIndex, reading: Result<f64, Fault>) {
         if let Some(balancing) = &self.balancing {
             let is_bled = reading.ok().map(|value| value != 0.0);
@@ -162,8 +156,8 @@ impl Findings {
         }
     }
 
-    /// Handles samples that the estimator has already processed. `is_prior`: whether the cell model is the model of a
-    /// label. Returns whether these samples completed a row of the detector.
+    /// Handles samples that the estimator has already processed. `is_prior`: whether the cell model comes from a label.
+    /// Returns whether these samples completed a row of the detector.
     #[inline]
     pub(crate) fn observe(
         &mut self,
@@ -218,7 +212,6 @@ fn rate_per_h(now: Timestamp, cell: usize, sampling: &Sampling, estimation: &Est
     Some(sampling.sampler.cell_current_a(now)? / estimation.bank.model(cell).rated_capacity_ah)
 }
 
-/// Creates the watch if the rule `thermal_event` is configured.
 fn thermal_watch(config: &MonitorConfig) -> Option<ThermalWatch> {
     let is_wanted = config.rules.iter().any(|rule| rule.rule == Rule::ThermalEvent);
     is_wanted.then(|| ThermalWatch::new(config.sample.cells.into(), config.sample.sensors().into()))

@@ -30,35 +30,30 @@ use crate::sample::Moment;
 /// Shortest time between two reports of rejected command frames (s).
 const BAD_COMMAND_S: f64 = 1.0;
 
-/// The intake stage.
 #[derive(Debug)]
 pub(crate) struct Intake {
     gate: FloodGate,
     guards: Guards,
     pub(crate) senders: SecondSenders,
-    /// Senders of J1939 groups. They are not stored.
+    /// Senders of J1939 parameter groups. Not part of the stored state.
     pub(crate) group_senders: GroupSenders,
     pub(crate) own: OwnFrames,
     buses: Buses,
-    /// Gate of authenticated commands.
     pub(crate) command_gate: CommandGate,
     /// Controllers, in the listener's order.
     pub(crate) controllers: Vec<Controller>,
-    /// Reassembles diagnostic answers.
     pub(crate) listener: Listener,
-    /// Per controller: start of the answer that is now being received.
+    /// Per controller: start of the answer that is being received.
     pub(crate) moments: Vec<Option<Moment>>,
-    /// Time of the last report of a rejected command frame.
     pub(crate) bad_command_at: Option<Timestamp>,
 }
 
-/// A received frame.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct ReceivedFrame<'a> {
     pub(crate) bus: BusIndex,
     pub(crate) frame: &'a Frame,
-    /// The freshness that the frame's authenticator confirms; `None` = no value fits, or the authenticator was not
-    /// checked.
+    /// The freshness for which the frame's authenticator is correct. `None` if no value fits, or if the authenticator
+    /// was not checked.
     pub(crate) freshness: Option<u64>,
 }
 
@@ -74,7 +69,6 @@ impl Admission {
     }
 }
 
-/// Stored state of the stage: counts, freshness of commands, faults of interfaces.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct IntakeState {
@@ -84,13 +78,12 @@ pub(crate) struct IntakeState {
     pub(crate) commands: CommandGate,
     senders: Vec<MessageRate>,
     pub(crate) buses: Buses,
-    /// State that is valid only while frames are received without a break; `None` in a state for a restart, because
+    /// State that is valid only while frames are received without a break. `None` in a state for a restart, because
     /// frames are missed during the restart.
     progress: Option<Box<IntakeProgress>>,
 }
 
 impl IntakeState {
-    /// Drops the state that is valid only while frames are received without a break.
     pub(crate) fn restart(&mut self) {
         self.progress = None;
     }
@@ -111,10 +104,8 @@ pub(crate) struct IntakeProgress {
 /// Counts of a controller that answers diagnostic requests.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ControllerCount {
-    /// The controller.
     #[serde(flatten)]
     pub controller: Controller,
-    /// Counts of the controller's answers.
     #[serde(flatten)]
     pub counts: ControllerCounts,
 }
@@ -207,14 +198,13 @@ impl Intake {
         self.guards.next_counter(config.bus, config.plan.id())
     }
 
-    /// Handles an event of an interface.
     pub(crate) fn handle_bus_event(&mut self, now: Timestamp, bus: BusIndex, event: BusEvent, out: &mut Outputs) {
         self.buses.handle_event(now, bus, event);
         out.events.push(Event { time: now, kind: EventKind::Bus { bus, what: event } });
     }
 
-    /// Value for the rule about interfaces (s): how long the longest present fault of an interface has lasted. Another
-    /// node that uses identifiers of the daemon's frames also counts as a fault.
+    /// Value for the rule about interface faults (s): duration of the longest present fault. Another node that uses
+    /// identifiers of the daemon's frames also counts as a fault.
     pub(crate) fn bus_fault(&self, now: Timestamp, interfaces: usize) -> Observation {
         let (fault_s, is_whole) = self.buses.worst_s(now, interfaces);
         let foreign_s = Some(self.own.longest_s(now)).filter(|seconds| *seconds > 0.0);
@@ -244,22 +234,18 @@ impl Intake {
         self.report(now, out);
     }
 
-    /// Per protected message, the count of each status.
     pub(crate) fn protected(&self) -> impl Iterator<Item = GuardCounts> + '_ {
         self.guards.counts()
     }
 
-    /// Messages with dropped frames.
     pub(crate) fn dropped(&self) -> impl Iterator<Item = FloodCount> + '_ {
         self.gate.counts()
     }
 
-    /// Counts per controller that answers diagnostic requests.
     pub(crate) fn controllers(&self) -> impl Iterator<Item = ControllerCount> + '_ {
         self.listener.counts().map(|(controller, counts)| ControllerCount { controller, counts })
     }
 
-    /// The state to be stored.
     pub(crate) fn snapshot(&self) -> IntakeState {
         IntakeState {
             protected: self.guards.counts().collect(),
@@ -272,7 +258,6 @@ impl Intake {
         }
     }
 
-    /// State that is valid only while frames are received without a break.
     fn progress(&self) -> IntakeProgress {
         IntakeProgress {
             protected: self.guards.progress(),
@@ -284,7 +269,6 @@ impl Intake {
         }
     }
 
-    /// Messages with a second sender.
     pub(crate) fn second_senders(&self) -> impl Iterator<Item = (BusIndex, CanId)> + '_ {
         self.senders.doubtful()
     }
@@ -294,7 +278,6 @@ impl Intake {
         self.own.uses()
     }
 
-    /// Resumes the state that is valid only while frames are received without a break.
     fn resume(&mut self, stored: &IntakeProgress) {
         self.guards.resume(&stored.protected);
         self.gate.resume(&stored.floods);
@@ -306,7 +289,6 @@ impl Intake {
         self.own.resume(&stored.own);
     }
 
-    /// Restores a stored state.
     pub(crate) fn restore(&mut self, state: IntakeState) {
         self.guards.restore(&state.protected);
         self.gate.restore(&state.dropped);

@@ -34,10 +34,9 @@ use crate::quantity::catalogue::{Quantity, RecordedValues};
 use crate::quantity::{CellIndex, InvalidState, Mode, Timestamp, bounds};
 use crate::sample::CellSample;
 
-/// Largest distance from the model's highest voltage during the constant-voltage phase of a charge (V).
+/// In the constant-voltage phase of a charge, the voltage is at most this far below the model's highest voltage (V).
 const TAPER_BAND_V: f64 = 0.03;
 
-/// The learning stage.
 #[derive(Debug)]
 pub(crate) struct Learning {
     pub(crate) config: HealthConfig,
@@ -70,7 +69,6 @@ pub(crate) struct LearningState {
     pub(crate) pack: Option<PackState>,
 }
 
-/// Health of one cell.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 pub(crate) struct CellHealth {
     /// SOC after the last full charge; 1 before the first full charge.
@@ -153,7 +151,6 @@ impl LearningState {
         }
     }
 
-    /// Shifts all timestamps by `by_nanos`, to another clock.
     pub(crate) fn rebase(&mut self, by_nanos: i64) {
         self.detector.rebase(by_nanos);
         self.learner.rebase(by_nanos);
@@ -181,7 +178,6 @@ impl LearningState {
 }
 
 impl Learning {
-    /// Creates the stage. `bank`: the cells' new estimators.
     pub(crate) fn new(config: &MonitorConfig, bank: &PackBank) -> Self {
         Self {
             config: config.health,
@@ -199,24 +195,23 @@ impl Learning {
         self.lives = PackLife::new(bank, &self.config);
     }
 
-    /// Charge, rest or discharge.
     pub(crate) fn mode(&self) -> Mode {
         self.state.detector.mode()
     }
 
-    /// Published capacity of a cell.
+    /// Capacity of a cell (Ah): the learned value, or the initial value before the first learning.
     pub(crate) fn capacity(&self, index: usize) -> ScalarGaussian {
         self.state.learner.capacity(index)
     }
 
-    /// Published capacity of a cell, if it has been learned.
+    /// Capacity of a cell (Ah), if it has been learned.
     pub(crate) fn learned_capacity(&self, index: usize) -> Option<ScalarGaussian> {
         self.state.learner.has_learned(index).then(|| self.capacity(index))
     }
 
-    /// Ends a mode. If this completes a half-cycle, every cell learns from the half-cycle. `is_label`: whether
-    /// the model of the pack's own kind of cells is the model of a label, neither given nor learned. `is_doubtful`: per
-    /// cell, whether the current was doubtful or the cell's voltage is frozen. A doubtful cell learns no capacity.
+    /// Ends a mode. If this completes a half-cycle, every cell learns from the half-cycle. `is_label`: whether the
+    /// model of the cells outside modules comes from a label and has not been learned. `is_doubtful`: for each cell,
+    /// whether the current was doubtful or the cell's voltage is frozen. A doubtful cell learns no capacity.
     pub(crate) fn complete_mode(
         &mut self,
         change: ModeChange,
@@ -234,7 +229,7 @@ impl Learning {
             }
         });
         to.event(EventKind::Mode { from: change.from, to: change.to });
-        // If readings of the current stop, keep the evidence for the offset and the slow branches until the next change
+        // If the current readings stop, keep the evidence for the offset and the slow RC branches until the next change
         // of mode.
         if change.to != Mode::Unknown {
             self.learn_offset(bank, to.now);
@@ -304,7 +299,7 @@ impl Learning {
             health.full_soc = half_cycle.end_soc.unwrap_or(health.full_soc);
         }
         // Discharges update the usable capacity. A charge only sets the first value, because a charge measures the
-        // charging resistance.
+        // resistance to charging instead of discharging.
         let is_discharge = half_cycle.mode == Mode::Discharge;
         let is_restated = is_discharge || health.usable.is_none();
         if let Some(usable) = config.usable.as_ref().filter(|_| is_restated) {
@@ -346,8 +341,8 @@ impl Learning {
         }
     }
 
-    /// Handles a reset of a cell's filter: the capacity becomes doubtful, and the recharge timer restarts, because the
-    /// SOC jumped without charge.
+    /// Handles a reset of a cell's filter. The capacity becomes doubtful. The recharge timer restarts, because the SOC
+    /// jumped without charge.
     pub(crate) fn handle_reset(&mut self, cell: CellIndex, bank: &mut PackBank) {
         self.state.recharge = RechargeTimer::default();
         let new_std_ah = bank.config(cell.index()).initial.capacity_std_ah;

@@ -1,5 +1,5 @@
-//! The stages of the data path. Each stage has its configuration, its state and its methods; no stage knows the whole
-//! data path.
+//! The stages of the data path. Each stage has its configuration, its state and its methods, and does not depend on
+//! later stages.
 
 pub(crate) mod alarming;
 pub(crate) mod estimation;

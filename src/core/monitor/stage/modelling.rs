@@ -1,17 +1,17 @@
-//! Modelling stage: learns a model of the pack's own cells from data of the vehicle.
+//! Modelling stage: learns a model of the pack's cells (without modules of another kind) from data of the vehicle.
 //!
-//! In: the steps of all cells, and the times at which the vehicle rests or sleeps. Out: a new model for the
-//! estimators, with the state in which they continue, and a [`ModelView`]. The stage learns a model only if the
-//! configuration describes the cells by a [`Label`]; otherwise the model comes from a file.
+//! In: the filter steps of these cells, and the times at which the vehicle rests or sleeps. Out: a new model for the
+//! estimators, the state in which they continue, and a [`ModelView`]. The stage learns a model only if the
+//! configuration describes the cells by a [`Label`]. Otherwise the model comes from a file.
 //!
-//! The [`Notebook`] collects rows: means of the cells' data over a short time. When the vehicle rests and there are
-//! enough new rows, a new model is fitted. The estimators change to the new model during the rest, never while driving.
-//! The fit is a [`FitTask`] that starts some time before the change, so that a host can run it on another thread.
+//! The [`Notebook`] collects rows, which are means of the cells' data over a short time. If the vehicle rests and there
+//! are enough new rows, a fit starts. The fit is a [`FitTask`], which a host can run on another thread. The estimators
+//! change to the new model some time later during the rest, never while driving.
 //!
 //! The task also compares the present model and the previous model on the new rows, to which neither was fitted. If the
-//! previous model predicts these rows clearly better, the present model is dropped. A settled model is fitted again
-//! only if the pack has reached another range of temperature or state of charge. Until then, only the half-cycles
-//! update the capacity.
+//! previous model predicts these rows clearly better, the present model is dropped. A settled model has little
+//! remaining uncertainty. It is fitted again only if the pack has reached another range of temperature or state of
+//! charge. Until then, only the half-cycles update the capacity.
 
 use serde::{Deserialize, Serialize};
 
@@ -25,7 +25,7 @@ use crate::monitor::config::MonitorConfig;
 use crate::monitor::message::{Event, EventKind, ModelState};
 use crate::quantity::{InvalidState, Mode, Timestamp};
 
-/// Fewest new rows for a fit, and smallest charge moved in these rows, fraction of the rated capacity.
+/// Smallest number of new rows for a fit, and smallest charge moved in these rows (fraction of the rated capacity).
 const LEAST_NEW_ROWS: usize = 6;
 const LEAST_NEW_CHARGE: f64 = 0.12;
 
@@ -35,10 +35,11 @@ const REST_S: f64 = 120.0;
 /// Time (s) from the start of a fit to the change of the model. Even a slow computer fits a model in less time.
 const FIT_S: f64 = 30.0;
 
-/// Largest misfit of a usable fit. With typical sensors, the misfit is at most 0.65. It is larger after heavy load in
-/// the cold, with a faulty sensor, or if the pack was exchanged between the rows.
+/// Largest misfit of a usable fit: root mean square of the residuals, in standard deviations. With typical sensors, the
+/// misfit is at most 0.65. It is larger after heavy load in the cold, with a faulty sensor, or if the pack was
+/// exchanged between the rows.
 const MOST_MISFIT: f64 = 0.7;
-/// If the misfit of a fit exceeds this value, the present model is dropped, too, unless it is settled. The rows then
+/// If the misfit of a fit exceeds this value, the present model is also dropped, unless it is settled. The rows then
 /// deviate even from the best model by more than the assumed errors.
 const HOPELESS_MISFIT: f64 = 1.0;
 
@@ -46,14 +47,12 @@ const HOPELESS_MISFIT: f64 = 1.0;
 /// deviation of 0.1. Rows that determine the capacity poorly also determine the curve poorly.
 const MOST_CAPACITY_STD: f64 = 0.05;
 
-/// Maximum number of stored changes of the model.
 const MAX_CHANGES: usize = 16;
 
-/// A change of the model: its time, and the state after it.
+/// A change of the model.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ModelChange {
-    /// Time of the change.
     pub time: Timestamp,
     /// State of the model after the change.
     pub state: ModelState,
@@ -67,7 +66,7 @@ pub struct ModelChange {
     pub is_taken_back: bool,
 }
 
-/// View of the cells' model and of how the model was learned.
+/// The cell model, and how it was learned.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ModelView<'a> {
     /// How well the model is known.
@@ -90,7 +89,6 @@ pub struct ModelView<'a> {
     pub changes: &'a [ModelChange],
 }
 
-/// The modelling stage.
 #[derive(Debug)]
 pub(crate) struct Modelling {
     label: Option<Label>,
@@ -104,29 +102,23 @@ pub(crate) struct Modelling {
     is_offered: bool,
     /// A task that the host has run, with its findings.
     given: Option<(FitTask, FitFindings)>,
-    /// Outcome of the latest fit.
     outcome: FitOutcome,
 }
 
-/// Outcome of a fit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum FitOutcome {
-    /// The model did not change.
     Nothing,
-    /// The new model is used.
     Adopted,
     /// A model was dropped: the previous model or the label's model is used again.
     Returned,
 }
 
-/// Stored state of the stage.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct ModellingState {
     /// The label with which the state was learned.
     label: Option<Label>,
     notebook: Notebook,
-    /// The present learned model.
     own: Option<OwnModel>,
     /// The previous model; `None` = the label's model.
     before: Option<OwnModel>,
@@ -134,11 +126,9 @@ pub(crate) struct ModellingState {
     fits: u32,
     taken_back: u32,
     changes: Vec<ModelChange>,
-    /// Start of the present rest.
     rest_since: Option<Timestamp>,
     /// Start of the fit in progress. No row is closed during a fit.
     fit_since: Option<Timestamp>,
-    /// Whether a row is complete.
     has_row: bool,
 }
 
@@ -162,7 +152,6 @@ impl ModellingState {
         (self.rest_since, self.fit_since, self.has_row) = (None, None, false);
     }
 
-    /// Checks the numbers of a stored state.
     pub(crate) fn check(&self) -> Result<(), InvalidState> {
         self.notebook.check()?;
         self.own.iter().chain(&self.before).try_for_each(OwnModel::check)?;
@@ -170,7 +159,7 @@ impl ModellingState {
         InvalidState::unless(count <= most, "the changes of the model", count as f64, "at most 16")
     }
 
-    /// View of the model for cells with this label; `label` is `None` if the model comes from a file.
+    /// `label`: the label of the cells; `None` if the model comes from a file.
     fn view(&self, label: Option<Label>) -> ModelView<'_> {
         let Self { notebook, own, chemistry, fits, taken_back, changes, .. } = self;
         let state = match (label, own) {
@@ -194,7 +183,7 @@ impl ModellingState {
     }
 
     /// View of the stored model, for the label with which it was learned. If the stored state has no label, uses
-    /// `label`; `None` without either.
+    /// `label`. `None` if there is no label.
     pub(crate) fn stored_view(&self, label: Option<Label>) -> Option<ModelView<'_>> {
         let label = self.label.or(label)?;
         Some(self.view(Some(label)))
@@ -221,13 +210,11 @@ impl Modelling {
         }
     }
 
-    /// Applies the settings of a new configuration that has the same cells.
     pub(crate) fn reconfigure(&mut self, config: &MonitorConfig) {
         (self.model, self.estimator) = (config.model.clone(), config.estimator);
         self.fleet.clone_from(&config.fleet);
     }
 
-    /// Forgets the learned model, because another pack is connected.
     pub(crate) fn forget(&mut self) {
         self.state = ModellingState::default();
     }
@@ -253,7 +240,6 @@ impl Modelling {
         learned.unwrap_or_else(|| (self.model.clone(), self.estimator))
     }
 
-    /// Adds a cell's step to the notebook.
     #[inline]
     pub(crate) fn note(&mut self, step: &CellStep) {
         if self.label.is_some() {
@@ -273,8 +259,8 @@ impl Modelling {
         self.state.notebook.close_row(&self.notebook, soc);
     }
 
-    /// Handles the pack's mode. Returns whether the fit in progress is due to end. If so, the caller calls
-    /// [`Self::refit`].
+    /// Tracks the rest of the vehicle by the pack's mode. Returns whether the fit in progress is due to end. If so, the
+    /// caller calls [`Self::refit`].
     pub(crate) fn observe_mode(&mut self, now: Timestamp, mode: Mode) -> bool {
         if self.label.is_none() || mode != Mode::Rest {
             (self.state.rest_since, self.state.fit_since) = (None, None);
@@ -297,8 +283,8 @@ impl Modelling {
         is_new.then(|| self.task()).flatten()
     }
 
-    /// Receives the findings of a task that the host has run. Without them, the stage runs the task itself, with the
-    /// same result.
+    /// Receives the findings of a task that the host has run. If the host gives no findings, the stage runs the task
+    /// itself, with the same result.
     pub(crate) fn give(&mut self, task: FitTask, findings: FitFindings) {
         self.given = Some((task, findings));
     }
@@ -351,8 +337,8 @@ impl Modelling {
             return self.return_to_label().or_else(|| unless_fitted(self));
         }
         let Some(fitted) = fit else { return unless_fitted(self) };
-        // A fit of LFP cells is not used: hysteresis hides the flat curve of LFP, and the error assumed for a row does
-        // not include hysteresis.
+        // Fits of LFP cells are not used. Hysteresis hides the flat voltage curve of LFP, and the error assumed for a
+        // row does not include hysteresis.
         let is_flat = label.chemistry == Chemistry::LfpGraphite;
         let is_rough = fitted.misfit > MOST_MISFIT;
         if is_flat || is_rough || fitted.own.capacity.std() > MOST_CAPACITY_STD * fitted.own.capacity.mean {
@@ -389,8 +375,8 @@ impl Modelling {
         Adoption { model, config, mean, with_capacity: true, is_learned: false }
     }
 
-    /// The configured model, for cells whose stored estimates were made with another model of a label. `soc`: mean of the
-    /// stored estimates. A stored `capacity` that is known better than the configured capacity is kept.
+    /// The configured model, for cells whose stored estimates come from the model of another label. `soc`: mean of the
+    /// stored estimates. The stored `capacity` is kept if it is more accurate than the configured capacity.
     pub(crate) fn other_model_adoption(&self, soc: Option<ScalarGaussian>, capacity: ScalarGaussian) -> Adoption {
         let adoption = self.label_adoption();
         let with_capacity = capacity.variance > adoption.mean.capacity.variance;
@@ -426,7 +412,6 @@ impl Modelling {
         Some(Event { time, kind })
     }
 
-    /// View of the cells' model.
     pub(crate) fn view(&self) -> ModelView<'_> {
         ModelView { fleet: self.fleet.as_ref(), ..self.state.view(self.label) }
     }

@@ -20,7 +20,6 @@ pub(crate) struct Publisher<'a> {
 }
 
 impl Publisher<'_> {
-    /// Publishes an event.
     pub(crate) fn event(&mut self, kind: EventKind) {
         self.out.events.push(Event { time: self.now, kind });
     }
@@ -63,7 +62,6 @@ impl Publisher<'_> {
         self.sending.poll_j1939(self.now, self.out);
     }
 
-    /// Passes the present alarms to the J1939 node.
     pub(crate) fn update_trouble_codes(&mut self) {
         self.sending.update_trouble_codes(self.now, &self.alarming.engine);
     }

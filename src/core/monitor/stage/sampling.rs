@@ -1,8 +1,9 @@
 //! Sampling stage: turns readings into cell samples, and detects which pack is connected.
 //!
 //! In: decoded readings, each a value or a fault. Out: a [`CellSample`] for each good voltage, an event for each signal
-//! that turns bad or good, and the pack's identity once enough consecutive readings agree. Bad readings of the identity are ignored. The
-//! identity is stored, so that an exchange of the pack during a downtime is detected.
+//! that turns bad or good, and the pack's identity. A new identity counts after a configured number of consecutive
+//! equal readings; bad readings are ignored. The identity is stored, so that an exchange of the pack during a downtime
+//! is detected.
 
 use serde::{Deserialize, Serialize};
 
@@ -11,7 +12,6 @@ use crate::monitor::message::{Event, EventKind, Outputs};
 use crate::quantity::{CellIndex, Channel, Fault, Reading, Timestamp};
 use crate::sample::{CellSample, Sampler, SamplerState, SignalChange, VoltageSource};
 
-/// The sampling stage.
 #[derive(Debug)]
 pub(crate) struct Sampling {
     pub(crate) sampler: Sampler,
@@ -25,7 +25,6 @@ pub(crate) struct Sampling {
     changes: Vec<SignalChange>,
 }
 
-/// Stored state of the stage.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct SamplingState {
@@ -48,7 +47,7 @@ impl SamplingState {
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(crate) struct Identity {
     pub(crate) known: Option<f64>,
-    /// An identity that differs from the known identity, and how many consecutive readings have shown it.
+    /// An identity other than the known identity, and the number of consecutive readings that have shown it.
     candidate: Option<(f64, u32)>,
 }
 
@@ -72,7 +71,7 @@ impl Identity {
 }
 
 impl Identity {
-    /// Whether a reading shows another identity than the connected pack has; `None` if either is unknown.
+    /// Whether a reading shows an identity other than the connected pack's; `None` if either identity is unknown.
     pub(crate) fn is_other(&self, reading: Result<f64, Fault>) -> Option<bool> {
         let value = reading.ok().filter(|value| value.is_finite())?;
         Some(self.known? != value)
@@ -91,7 +90,6 @@ impl Sampling {
         }
     }
 
-    /// The state to be stored.
     pub(crate) fn snapshot(&self) -> SamplingState {
         SamplingState {
             sampler: self.sampler.snapshot(),
@@ -101,7 +99,6 @@ impl Sampling {
         }
     }
 
-    /// Restores a state whose shape [fits](Sampler::fits).
     pub(crate) fn restore(&mut self, state: SamplingState) {
         self.sampler.restore(state.sampler);
         self.identity = state.identity;
@@ -130,7 +127,6 @@ impl Sampling {
         self.identity.observe(value, self.identity_readings)
     }
 
-    /// Detects signals that have become stale.
     pub(crate) fn poll(&mut self, now: Timestamp, out: &mut Outputs) {
         self.sampler.poll(now, &mut self.changes);
         self.report(now, out);
@@ -149,7 +145,6 @@ impl Sampling {
         })
     }
 
-    /// The channel of a cell's voltage.
     pub(crate) fn voltage_channel(&self, cell: CellIndex) -> Channel {
         match self.sampler.config().voltage_source {
             VoltageSource::Cells => Channel::CellVoltage(cell),

@@ -31,12 +31,11 @@ const TEST_PERIOD_S: f64 = 0.1;
 /// Longest duration of a test (s), so that a forgotten test ends.
 pub const MAX_TEST_S: f64 = 600.0;
 
-/// Number of immediate replies after a pause; further replies are at least [`REPLY_DELAY_MS`] apart, and replies in
-/// between are dropped. A small number suffices, because a sender of commands waits for each reply.
+/// Number of replies that may be sent at once after a pause. Further replies are at least [`REPLY_DELAY_MS`] apart, and
+/// replies in between are dropped. A small number suffices, because a sender of commands waits for each reply.
 const REPLY_BURST: i64 = 5;
 const REPLY_DELAY_NS: i64 = REPLY_DELAY_MS as i64 * 1_000_000;
 
-/// The sending stage.
 #[derive(Debug)]
 pub(crate) struct Sending {
     config: Option<OutputConfig>,
@@ -52,7 +51,6 @@ pub(crate) struct Sending {
     polled: PollOutputs,
 }
 
-/// Stored state of the stage.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct SendingState {
@@ -70,14 +68,12 @@ impl SendingState {
         self.poller.take_if(|poller| !poller.restart(now));
     }
 
-    /// Shifts stored times to another clock.
     pub(crate) fn rebase(&mut self, by_nanos: i64) {
         self.schedule.rebase(by_nanos);
         self.poller.iter_mut().for_each(|poller| poller.rebase(by_nanos));
     }
 }
 
-/// A running test of an alarm frame.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 pub(crate) struct AlarmTest {
     rule: Rule,
@@ -105,7 +101,6 @@ impl Sending {
         }
     }
 
-    /// The state to be stored.
     pub(crate) fn snapshot(&self) -> SendingState {
         SendingState {
             schedule: self.schedule.clone(),
@@ -180,10 +175,10 @@ impl Sending {
         self.schedule.housekeeping = self.schedule.housekeeping.min(now);
     }
 
-    /// Omits cyclic frames while the buses sleep, unless they are configured.
+    /// While the buses sleep, omits cyclic frames, unless the configuration requests them.
     pub(crate) fn set_asleep(&mut self, now: Timestamp, is_asleep: bool) {
-        // A poller receives every frame, so it knows whether a bus sleeps. Between two polls, the inputs are silent on an
-        // awake bus, too.
+        // If a poller is configured, the inputs of an awake bus are silent between two polls. The poller receives every
+        // frame, so it decides whether the bus sleeps.
         let is_asleep = is_asleep && self.poller.as_ref().is_none_or(|poller| poller.is_bus_asleep(now));
         let is_omitted = self.config.as_ref().is_none_or(|config| !config.while_asleep);
         self.schedule.is_quiet = is_asleep && is_omitted && now >= self.schedule.quiet_from;
@@ -256,7 +251,6 @@ impl Sending {
         [sending, test, node, poller].into_iter().flatten().fold(schedule.housekeeping, Timestamp::min)
     }
 
-    /// Whether housekeeping is due.
     pub(crate) fn take_housekeeping_due(&mut self, now: Timestamp, period_s: f64) -> bool {
         take_due(&mut self.schedule.housekeeping, now, period_s)
     }
@@ -266,7 +260,6 @@ impl Sending {
         Some(self.schedule.take_frames_due(now, self.config.as_ref()?))
     }
 
-    /// Whether the frame that announces the freshness for commands is due.
     pub(crate) fn take_freshness_due(&mut self, now: Timestamp) -> bool {
         let is_sent = |config: &OutputConfig| config.plan.authentication(LayoutMessage::Freshness).is_some();
         self.config.as_ref().is_some_and(is_sent) && self.schedule.take_freshness_due(now)
@@ -283,12 +276,10 @@ impl Sending {
         out.frames.extend(buses_of(output, bus).map(transmit));
     }
 
-    /// Sends the status frame.
     pub(crate) fn send_status(&mut self, now: Timestamp, fields: &StatusFields, out: &mut Outputs) {
         self.send(now, LayoutMessage::Status, out, |plan, counters| Some(plan.status(fields, counters)));
     }
 
-    /// Sends all pages of the health frame.
     pub(crate) fn send_health(&mut self, now: Timestamp, fields: &HealthFields, out: &mut Outputs) {
         let pages = self.config.as_ref().map_or(0, |output| output.plan.health_pages());
         for page in 0..pages {
@@ -306,7 +297,6 @@ impl Sending {
         }
     }
 
-    /// Sends the due alarms within the budget.
     pub(crate) fn send_due_alarms(&mut self, now: Timestamp, engine: &AlarmEngine, out: &mut Outputs) {
         let Some(period_s) = self.config.as_ref().map(|config| config.alarm_period_s) else { return };
         if self.schedule.is_quiet {
@@ -364,7 +354,6 @@ impl Sending {
         self.send_alarm_fields(now, &fields, out);
     }
 
-    /// Sends all pages of the digest.
     pub(crate) fn send_digest(&mut self, now: Timestamp, engine: &AlarmEngine, out: &mut Outputs) {
         let Some(config) = &self.config else { return };
         let (pages, period_s) = (config.plan.digest_pages(), config.alarm_period_s);
@@ -464,7 +453,6 @@ impl Sending {
         }
     }
 
-    /// Ends a running test.
     pub(crate) fn end_test(&mut self, now: Timestamp, engine: &AlarmEngine, out: &mut Outputs) {
         let Some(AlarmTest { rule, .. }) = self.test.take() else { return };
         self.send_test(now, rule, AlarmState::Inactive, out);
@@ -494,7 +482,6 @@ impl Sending {
         out.events.extend(self.polled.changes.drain(..).map(event));
     }
 
-    /// Handles a reading of the vehicle's supply voltage.
     pub(crate) fn handle_supply(&mut self, now: Timestamp, value: Result<f64, Fault>) {
         if let (Some(poller), Some(supply)) = (&mut self.poller, self.supply) {
             let is_good = value.is_ok_and(|volts| volts >= supply.minimum_v);
@@ -517,7 +504,6 @@ impl Sending {
         }
     }
 
-    /// Sends the due frames of the J1939 node.
     pub(crate) fn poll_j1939(&mut self, now: Timestamp, out: &mut Outputs) {
         if let Some(j1939) = &mut self.j1939 {
             if self.schedule.is_quiet {
@@ -527,7 +513,6 @@ impl Sending {
         }
     }
 
-    /// Passes the present alarms to the J1939 node.
     pub(crate) fn update_trouble_codes(&mut self, now: Timestamp, engine: &AlarmEngine) {
         if let Some(j1939) = &mut self.j1939 {
             j1939.update_trouble_codes(now, engine, self.test.is_some());

@@ -14,7 +14,7 @@ use crate::cell::StepResult;
 use crate::monitor::message::{BusEvent, Event, EventKind, RecordKind};
 use crate::quantity::BusIndex;
 
-/// Adds to a count without overflow, because a stored count may have any value.
+/// Adds to a count and saturates, because a stored count may have any value.
 fn add(count: &mut u64, by: u64) {
     *count = count.saturating_add(by);
 }
@@ -34,7 +34,6 @@ pub struct Statistics {
     pub trust_lost: u64,
     /// Number of periods without measurements: computer asleep, program not running, or gap in the log.
     pub gaps: u64,
-    /// Number of mode changes.
     pub mode_changes: u64,
     /// Half-cycles and their results.
     #[serde(flatten)]
@@ -45,7 +44,6 @@ pub struct Statistics {
     pub commands: u64,
     /// Number of rejected command frames.
     pub bad_commands: u64,
-    /// Number of times the pack was replaced.
     pub packs_replaced: u64,
     /// Number of times a stored state was restored at a start.
     pub restores: u64,
@@ -82,7 +80,7 @@ pub struct LearningCounts {
     pub half_cycles: u64,
     /// Updates of a capacity filter, summed over the cells.
     pub capacity_updates: u64,
-    /// Updates of a capacity filter with a measurement.
+    /// Updates of a capacity filter that used a measurement.
     pub capacity_measurements: u64,
     /// Recharge periods recorded, raw or normalised.
     pub recharge_periods: u64,
@@ -93,7 +91,6 @@ pub struct LearningCounts {
 pub struct BusStatistics {
     /// Received frames.
     pub frames: u64,
-    /// Error frames.
     pub error_frames: u64,
     /// Error frames that report bus-off.
     pub bus_offs: u64,
@@ -112,11 +109,8 @@ impl BusStatistics {
 /// Numbers of alarms by severity.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct AlarmCounts {
-    /// Alarms of severity `info`.
     pub info: u64,
-    /// Alarms of severity `warning`.
     pub warning: u64,
-    /// Alarms of severity `severe`.
     pub severe: u64,
 }
 
@@ -174,7 +168,6 @@ impl Statistics {
         }
     }
 
-    /// Counts a record and its events.
     pub(crate) fn note(&mut self, kind: &RecordKind, events: &[Event]) {
         match *kind {
             RecordKind::Frame { bus, .. } | RecordKind::SecuredFrame { bus, .. } => add(&mut self.bus(bus).frames, 1),
@@ -213,7 +206,6 @@ impl Statistics {
         }
     }
 
-    /// Counts voltage readings by their effect on the cells' estimates.
     pub(crate) fn note_voltages<'a>(&mut self, results: impl Iterator<Item = &'a StepResult>) {
         let (mut all, mut compared, mut used) = (0, 0, 0);
         for StepResult { update, .. } in results {

@@ -1,5 +1,5 @@
-//! Energy, time and power of the pack and its cells, from the states of the stages. They are computed on demand, for a
-//! view.
+//! Remaining energy, time to empty or full, and available power of the pack. These values are computed on demand from
+//! the states of the stages.
 
 use super::{EventKind, Stages};
 use crate::cell::{ModelBands, arrhenius};
@@ -25,7 +25,8 @@ impl Stages {
         of_pack(config, (&learning.state.load, learning.mode()), &cells, &structure)
     }
 
-    /// Sets the values of energy, time and power. Returns the cells that limit the power of a discharge and of a charge.
+    /// Sets the values of energy, time and power. Returns the cell that limits the discharge and the cell that limits
+    /// the charge.
     pub(crate) fn set_outlook(&self, values: &mut PackValues) -> Option<[CellIndex; 2]> {
         let outlook = self.outlook();
         use Quantity as Q;
@@ -54,20 +55,23 @@ impl Stages {
         Some(EventKind::Outlook { values: RecordedPackValues::of(&values) })
     }
 
-    /// State of health by energy of the cell with the least capacity; `None` until every capacity has been learned.
+    /// Energy-based state of health of the cell with the lowest capacity; `None` until every capacity has been learned.
     pub(crate) fn energy_soh(&self) -> Option<ScalarGaussian> {
         let (index, _) = self.learning.weakest()?;
         Some(energy_health(&self.learning.config.outlook, &self.cell_state(index)?))
     }
 
-    /// State from which the outlook of a cell is computed; `None` before its first estimate, or without a temperature.
+    /// State of a cell, from which its energy and power are computed. `None` before the cell's first estimate, or
+    /// without a temperature.
     pub(crate) fn cell_state(&self, index: usize) -> Option<CellNow<'_>> {
         let bank = &self.estimation.bank;
         let (soc, temperature_c, estimator) = (bank.soc(index)?, bank.temperature_c(index)?, bank.cell(index));
-        // The filter learns one ratio for all SOC and temperatures; the model's error at this point remains.
+        // The filter learns one resistance ratio for all SOC values and temperatures. The model's error at this SOC and
+        // temperature remains.
         let local = ModelBands::new(bank.model(index)).resistance(soc.mean, temperature_c).local;
         let of_cell = estimator.log_resistance();
-        // Outside of its table, the model has the resistance of the nearest temperature.
+        // Outside its temperature table, the model uses the resistance at the nearest tabulated temperature. `outside`
+        // is the resulting error according to the Arrhenius law.
         let temperatures_c = &bank.model(index).temperature_c;
         let nearest_c = temperature_c.max(temperatures_c[0]).min(temperatures_c[temperatures_c.len() - 1]);
         let outside = libm::log(arrhenius(temperature_c) / arrhenius(nearest_c));

@@ -1,12 +1,11 @@
-//! Remembers the learned values of previously connected packs by pack number. When a pack returns, its values are
-//! restored.
+//! Stores the learned values of disconnected packs by pack number, and returns them when a pack is connected again.
 //!
-//! As soon as a reading shows another number, the learned values of the connected pack are put aside. In: these values,
-//! and the new number once it is confirmed. Out: the stored values of the pack with the new number, if there are any.
+//! If a reading shows another pack number, the learned values of the connected pack are put aside. Once the new number
+//! is confirmed, the values put aside are stored, and the stored values of the new pack are returned if there are any.
 //!
-//! The memory stores the learned cell model, capacities, resistances, remaining lives, recharge periods, findings and
-//! the current offset (a pack often has its own sensor). The unfinished half-cycle is not stored. The state of charge
-//! is not restored; the first voltage determines it. A pack without learned values is not stored, so that bogus pack
+//! The stored values are the cell model, capacities, resistances, remaining lives, recharge periods, findings and the
+//! current offset (a pack often has its own sensor). The unfinished half-cycle and the state of charge are not stored;
+//! the first voltage determines the state of charge. A pack without learned values is not stored, so that bogus pack
 //! numbers do not displace real packs.
 
 use serde::{Deserialize, Serialize};
@@ -19,7 +18,7 @@ use crate::monitor::stage::learning::{CellHealth, LearningState, Throughput, che
 use crate::monitor::stage::modelling::ModellingState;
 use crate::quantity::{InvalidState, bounds};
 
-/// Maximum number of stored packs, without the connected pack: a vehicle alternates between fewer packs.
+/// Maximum number of stored packs, not counting the connected pack. A vehicle alternates between fewer packs.
 const MAX_PACKS: usize = 8;
 /// Maximum number of cells in all stored packs together. One pack is stored even if it has more cells. A cell takes
 /// 2.6 kB of the stored state.
@@ -30,19 +29,16 @@ const MAX_CELLS: usize = 384;
 #[serde(deny_unknown_fields)]
 pub(crate) struct PackMemory {
     packs: Vec<StoredPack>,
-    /// Learned values that the connected pack had before readings started to show another pack number.
+    /// Learned values of the connected pack, put aside because a reading showed another pack number.
     aside: Option<Box<StoredPack>>,
 }
 
-/// Learned values of one pack.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct StoredPack {
     pub(crate) number: f64,
     pub(crate) cells: Vec<StoredCell>,
-    /// State of the cells' learned model.
     pub(crate) modelling: Option<ModellingState>,
-    /// State of the cell-fault detector.
     pub(crate) diagnosis: Option<CellFaultDetector>,
     pub(crate) learning: LearningState,
 }
@@ -62,18 +58,16 @@ pub(crate) struct StoredCell {
 }
 
 impl PackMemory {
-    /// Whether a pack has been put aside.
     pub(crate) fn has_aside(&self) -> bool {
         self.aside.is_some()
     }
 
-    /// Puts the connected pack aside, because its next voltages may belong to another pack.
+    /// Puts the values of the connected pack aside, because the next voltages may belong to another pack.
     pub(crate) fn put_aside(&mut self, pack: StoredPack) {
         self.aside = Some(Box::new(pack));
     }
 
-    /// Drops the pack that was put aside. Called if the pack's number was read again, or if the learned values no
-    /// longer apply.
+    /// Drops the values put aside. Called if the old number was read again, or if the learned values no longer apply.
     pub(crate) fn drop_aside(&mut self) {
         self.aside = None;
     }
@@ -103,13 +97,11 @@ impl PackMemory {
         }
     }
 
-    /// Keeps only the packs that fulfil `fits`.
     pub(crate) fn retain(&mut self, fits: impl Fn(&StoredPack) -> bool) {
         self.packs.retain(&fits);
         self.aside.take_if(|pack| !fits(pack));
     }
 
-    /// Checks that every stored value is possible.
     pub(crate) fn check(&self) -> Result<(), InvalidState> {
         for pack in self.packs.iter().chain(self.aside.as_deref()) {
             InvalidState::unless(pack.number.is_finite(), "the number of a pack", pack.number, "a finite number")?;
@@ -155,8 +147,8 @@ impl StoredCell {
         bounds::TIME_S.check("the unmeasured time used by a cell's filter", unmeasured_s)
     }
 
-    /// Whether the filter has as many branches as this cell of the bank. Cells of a module always fit, because the
-    /// module may have been replaced.
+    /// Whether the stored filter has as many RC branches as the bank's model of this cell. A cell of a module always
+    /// fits, because the module may have been replaced.
     pub(crate) fn fits(&self, bank: &PackBank, index: usize) -> bool {
         !bank.is_own(index) || CellEstimator::restore(&self.estimator, bank.model(index).branches.len()).is_some()
     }

@@ -1,8 +1,9 @@
-//! Passes the pack's values to the record of use, every 0.1 s while the bus is not silent.
+//! Passes the pack's values to the record of use (counters of how the pack was used), every 0.1 s while the buses are
+//! not silent.
 //!
-//! The current, and the SOC with it, is unknown while it is doubtful. While an input message has a second sender, all
-//! values are unknown. Limits come from `[outlook]`; without a limit of the voltage, from the cell models. If modules
-//! have other cells, the widest limits of the voltage apply.
+//! While the current is doubtful, current and SOC are passed as unknown. While an input message has a second sender,
+//! all values are passed as unknown. The limits come from `[outlook]`. If `[outlook]` has no voltage limits, the widest
+//! limits of the cell models apply.
 
 use super::Stages;
 use crate::health::{OutlookConfig, UseLimits, UseSample};

@@ -1,8 +1,8 @@
-//! Passes values to their alarm rules every 0.1 s. (The learning stage passes learned values when it learns them.)
+//! Passes measured and estimated values to their alarm rules every 0.1 s. The learning stage passes the learned values.
 //!
-//! In: all stages. Out: values for the [alarming](crate::monitor::stage::alarming) stage. If a part of a value is
-//! unknown, the value is passed as a bound, which can raise an alarm but not clear one. Fast path: if the worst value
-//! trips no threshold, the other values are only refreshed for display, once a second.
+//! In: the states of all stages. Out: values for the [alarming](crate::monitor::stage::alarming) stage. If a part of a
+//! value is unknown, the value is passed as a bound, which can raise an alarm but not clear one. Fast path: if the
+//! worst value trips no threshold, the other values are only refreshed for display, once a second.
 
 use super::Stages;
 use crate::alarm::{AlarmInput, Observation, Rule};
@@ -16,7 +16,6 @@ use crate::monitor::stage::publisher::learned;
 use crate::quantity::{CellIndex, Channel, Reading, Timestamp};
 use crate::sample::CellSample;
 
-/// Rules about learned values of a cell.
 const CELL_LEARNED: [Rule; 5] =
     [Rule::CapacityLow, Rule::UsableCapacityLow, Rule::ResistanceHigh, Rule::CellLeak, Rule::ConnectionResistance];
 
@@ -33,7 +32,7 @@ impl InputObservation {
     }
 }
 
-/// The larger of two values. If one of them is unknown, the result is a bound.
+/// The larger of two values. If either value is unknown or a bound, the result is a bound.
 fn worst(a: Observation, b: Observation) -> Observation {
     let is_known = |observation: &Observation| observation.value.is_some() && !observation.is_bound;
     Observation {
@@ -54,7 +53,7 @@ struct SocSpread {
 }
 
 impl Stages {
-    /// Passes the values of inputs and pack to their rules, and says for the learned values whether they are valid.
+    /// Passes the values of the inputs and the pack to their rules, and marks the learned values as valid or invalid.
     pub(crate) fn watch(&mut self, now: Timestamp, out: &mut Outputs) {
         let any_lost = self.sampling.sampler.any_lost();
         let worst = self.sampling.sampler.worst_input(now);
@@ -64,7 +63,7 @@ impl Stages {
         self.refresh_thermal(now, out);
     }
 
-    /// Watches a reading for a thermal event, and passes new evidence to its rule at once.
+    /// Checks a reading for a thermal event, and passes new evidence to the rule at once.
     #[inline]
     pub(crate) fn watch_reading(&mut self, now: Timestamp, reading: &Reading, out: &mut Outputs) {
         if let Some((cell, evidence)) = self.findings.watch_reading(now, reading, (&self.sampling, &self.estimation)) {
@@ -79,7 +78,7 @@ impl Stages {
         }
     }
 
-    /// Passes values about interfaces and files to their rules, and publishes all alarms.
+    /// Passes the states of the interfaces and the files to their rules, and publishes all alarms.
     pub(crate) fn watch_computer(&mut self, now: Timestamp, bus_fault: Observation, out: &mut Outputs) {
         let store = self.alarming.state.store.failing(now);
         let mut publisher = self.publisher(now, out);
@@ -87,12 +86,12 @@ impl Stages {
         publisher.observe(Rule::StoreFailed, None, store);
         publisher.apply(AlarmInput::Poll);
         publisher.publish_alarms();
-        // The trouble codes also say whether all values are known, which may change without an alarm.
+        // The trouble codes also report whether all values are known, which may change without an alarm.
         publisher.update_trouble_codes();
     }
 
     /// Passes the silence and the share of bad readings of every input to the two rules about inputs. A cell voltage
-    /// counts for its cell, every other input for the pack.
+    /// counts for its cell, and every other input counts for the pack.
     fn watch_inputs(&mut self, now: Timestamp, worst: Option<(f64, f64)>, out: &mut Outputs) {
         let engine = &self.alarming.engine;
         let quiet = |(silence_s, share): (f64, f64)| {
@@ -117,14 +116,15 @@ impl Stages {
         }
         if let Some(mut pack) = pack {
             if has_second_sender {
-                // It is unknown which readings come from the sensor, so no reading counts as good.
+                // With a second sender, a reading may come from a node other than the sensor, so no reading counts as
+                // good.
                 pack.bad_share = Observation::new(Some(1.0));
             }
             self.observe_input(now, None, pack, out);
         }
     }
 
-    /// Refreshes the displayed values of the inputs while no value changes an alarm.
+    /// Refreshes the displayed values of the inputs. Called while no value changes an alarm.
     fn show_inputs(&mut self, now: Timestamp) {
         let (sampler, engine) = (&self.sampling.sampler, &mut self.alarming.engine);
         let (mut longest_s, mut worst_share) = (0.0_f64, 0.0_f64);
@@ -145,10 +145,10 @@ impl Stages {
     fn input_observation(&self, now: Timestamp, channel: Channel) -> InputObservation {
         let sampler = &self.sampling.sampler;
         let silence_s = sampler.silence_s(channel, now);
-        // If no reading has arrived since waking, the input may still be waking up: only a long silence counts.
+        // An input without a reading since the last waking may still be starting, so only a long silence counts.
         let has_reading = sampler.has_input_since_waking(channel);
         let is_missing = |silence: &f64| self.alarming.missing_after_s.is_some_and(|limit| *silence > limit);
-        // The share of bad readings before a silence says nothing about the present.
+        // During a silence, the share of bad readings is out of date.
         let share = sampler.bad_share(channel).filter(|_| has_reading && !sampler.is_silent(channel, now));
         InputObservation {
             silence_s: Observation::new(silence_s.filter(|silence| has_reading || is_missing(silence))),
@@ -216,8 +216,8 @@ impl Stages {
         publisher.observe(Rule::BmsDisagrees, None, disagreement);
     }
 
-    /// SOC of the emptiest and the fullest cell, among the cells with a fresh estimate and a sound channel; `None`
-    /// without such a cell.
+    /// Lowest and highest SOC of the cells with a fresh estimate and a channel without a fault; `None` if there is no
+    /// such cell.
     fn soc_spread(&self, now: Timestamp, all_fresh: bool) -> Option<SocSpread> {
         let bank = &self.estimation.bank;
         if all_fresh
@@ -229,8 +229,8 @@ impl Stages {
         let (mut spread, mut known): (Option<SocSpread>, usize) = (None, 0);
         for cell in self.estimation.cell_indices() {
             let is_fresh = self.sampling.sampler.is_fresh(self.sampling.voltage_channel(cell), now);
-            // After a downtime, a voltage cannot be used before the first reading of the current. Until then, the SOC
-            // dates from before the downtime.
+            // After a downtime, voltages are not used before the first current reading. Until then, the SOC dates from
+            // before the downtime.
             let is_of_cell = !bank.is_carried_over(cell.index()) && !self.alarming.faulty_channels.contains(&cell);
             let is_present = is_fresh && is_of_cell;
             let Some(soc) = bank.soc(cell.index()).filter(|_| is_present) else { continue };
@@ -247,8 +247,8 @@ impl Stages {
         spread.map(|spread| SocSpread { is_whole: known == self.estimation.cells(), ..spread })
     }
 
-    /// Difference between the values that the BMS reports and the estimates: the larger of the differences in SOC and
-    /// in SOH.
+    /// Disagreement with the BMS: the larger of the absolute differences between reported and estimated SOC, and
+    /// between reported and estimated SOH.
     fn disagreement(&self, now: Timestamp) -> Observation {
         let config = self.sampling.sampler.config();
         let soc = self.learning.state.pack.map(|pack| ScalarGaussian::from_std(pack.soc, pack.soc_std));
@@ -304,13 +304,12 @@ impl Stages {
         }
     }
 
-    /// Judges whether a cell's innovations agree with their covariance, and reports a change as an event. `is_current`:
-    /// whether the innovations are recent; if so, also passes them to their rule.
+    /// Judges whether a cell's innovations agree with their covariance, and reports a change as an event. If the
+    /// innovations are recent (`is_current`), also passes them to their rule.
     pub(crate) fn judge_trust(&mut self, now: Timestamp, cell: CellIndex, is_current: bool, out: &mut Outputs) {
         let mean_nis = self.estimation.contradiction(cell.index());
         let change = self.estimation.judge_trust(cell);
-        // Without readings of the current, the filter continues, but its innovations say nothing about the cell's
-        // model.
+        // Without current readings, the filter continues, but its innovations do not test the cell's model.
         let is_observed = is_current && self.sampling.inputs_valid(cell, now);
         let mut publisher = self.publisher(now, out);
         if let Some(trusted) = change {
@@ -321,8 +320,9 @@ impl Stages {
         }
     }
 
-    /// Passes restored values to their rules. `was_brief`: whether the downtime was so short that measured values still
-    /// apply. `is_new`: true for the values of a pack that returned, which are new to the rules; false after a restart.
+    /// Passes restored values to their rules. Measured values are included only if the downtime was short
+    /// (`was_brief`). `is_new`: true for a pack that returned, because its values are new to the rules; false after a
+    /// restart.
     pub(crate) fn restate_known(&mut self, now: Timestamp, was_brief: bool, is_new: bool, out: &mut Outputs) {
         let old = |value: ScalarGaussian| Observation { is_new, ..learned(value) };
         for index in self.estimation.cell_indices() {
@@ -356,9 +356,9 @@ impl Stages {
         learning.lives.observe(is_new, &mut publisher);
     }
 
-    /// Passes the results of a row (a few minutes of samples) of the cell-fault detector to the rules about single
-    /// cells. `is_new`: whether the results are new to the rules. If they are new, skips the cells whose inputs are
-    /// lost; these cells wait for the next row.
+    /// Passes the cell-fault detector's results for a row (a few minutes of samples) to the rules about single cells.
+    /// If the results are new (`is_new`), skips the cells whose inputs are lost. The rules of these cells wait for the
+    /// next row.
     pub(crate) fn publish_diagnosis(&mut self, now: Timestamp, is_new: bool, out: &mut Outputs) {
         self.note_faulty_channels();
         let diagnosis = &self.findings.diagnosis;

@@ -1,16 +1,16 @@
-//! What the inputs show at one time: fresh, silent and lost signals, their latest values and their ranges.
+//! State of the inputs at one time: fresh, silent and lost signals, their latest values and their ranges.
 
 use super::Sampler;
 use crate::quantity::{CellIndex, Channel, Timestamp};
 use crate::sample::channels::limits;
 use crate::sample::signal::Signal;
 
-/// Lowest and highest value of several sensors at one time.
+/// Lowest and highest value of several sensors.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SensorRange {
     pub lowest: f64,
     pub highest: f64,
-    /// Whether the values of all sensors are known.
+    /// Whether all sensors have a value.
     pub is_whole: bool,
 }
 
@@ -35,16 +35,15 @@ impl SensorRange {
 }
 
 impl Sampler {
-    /// Time since the channel's latest reading, good or bad (s): the value of the rule `input_missing`.
+    /// Time since the channel's latest reading, good or bad (s), for the rule `input_missing`.
     pub fn silence_s(&self, channel: Channel, now: Timestamp) -> Option<f64> {
-        // Use the later of the two times; `None` is less than `Some`. Time before the start or the last waking does not
-        // count.
+        // Use the later of the two times, because time before the start or the last waking does not count.
         let since = self.state.signals[self.slot(channel)?].received.max(self.state.began);
         Some(since.map_or(0.0, |from| now.since(from).max(0.0)))
     }
 
-    /// Share of bad readings on a channel (fraction), averaged over about
-    /// [`BAD_SHARE_READINGS`](super::signal::BAD_SHARE_READINGS) readings; `None` = no reading yet.
+    /// Share of bad readings, averaged over about [`BAD_SHARE_READINGS`](super::signal::BAD_SHARE_READINGS) readings;
+    /// `None` = no reading yet.
     pub fn bad_share(&self, channel: Channel) -> Option<f64> {
         self.slot(channel).and_then(|slot| self.state.signals[slot].bad_share())
     }
@@ -54,17 +53,17 @@ impl Sampler {
         &self.channels
     }
 
-    /// The latest good reading, at any age, of every channel that has had a good reading: channel, time, value.
+    /// The latest good reading of each channel, at any age: channel, time, value.
     pub fn latest_readings(&self) -> impl Iterator<Item = (Channel, Timestamp, f64)> + '_ {
         let each = self.channels.iter().zip(&self.state.signals);
         each.filter_map(|(&channel, signal)| signal.good.map(|good| (channel, good.time, good.value())))
     }
 
-    /// Time without a reading on any channel (s); `None` = at most `quiet_s`, or no reading yet.
+    /// Time without any reading (s); `None` = at most `quiet_s`, or no reading yet.
     pub fn all_silent_s(&self, now: Timestamp, quiet_s: f64) -> Option<f64> {
         let received = |signal: &Signal| signal.received;
         let is_recent = |at: Timestamp| now.since(at) <= quiet_s;
-        // Check the current first, because it arrives more often than any other input and usually decides the result.
+        // Check the current first, because it arrives most often.
         if received(&self.state.signals[0]).is_some_and(is_recent) {
             return None;
         }
@@ -72,7 +71,7 @@ impl Sampler {
         (!is_recent(latest)).then(|| now.since(latest))
     }
 
-    /// The latest good reading of the pack current (A), regardless of its age; 0 while the contactors are open.
+    /// The latest good reading (A), regardless of its age; 0 while the contactors are open.
     pub fn latest_current_a(&self, now: Timestamp) -> Option<f64> {
         if self.state.charge.is_open(now) {
             return Some(0.0);
@@ -80,20 +79,20 @@ impl Sampler {
         self.state.signals[0].good.map(|good| good.value())
     }
 
-    /// The fresh temperatures of the sensors (degrees C); `None` = no fresh sensor.
+    /// Fresh temperatures (degrees C); `None` = no fresh sensor.
     pub fn temperature_range_c(&self, now: Timestamp) -> Option<SensorRange> {
         let sensors = &self.state.signals[1..=self.sensors];
         SensorRange::among(sensors.iter().map(|signal| signal.fresh(now, &self.config.temperature)))
     }
 
-    /// Longest time that a temperature, a voltage and a current is fresh (s).
+    /// Maximum age of a fresh temperature, voltage and current (s).
     pub fn max_ages_s(&self) -> [f64; 3] {
         let config = &self.config;
         [&config.temperature, &config.voltage, &config.current].map(|limits| limits.max_age_s)
     }
 
-    /// The fresh voltages of the cells (V), without the cells of which the voltage is `faulty`; `None` = no fresh
-    /// voltage. If only the pack's total is measured, this is the mean voltage of its cells.
+    /// Fresh voltages (V) without the `faulty` cells; `None` = no fresh voltage. If only the total voltage is measured,
+    /// this is the mean voltage of the cells.
     pub fn voltage_range_v(&self, now: Timestamp, faulty: &[CellIndex]) -> Option<SensorRange> {
         let first = 1 + self.sensors;
         let is_faulty = |index: usize| faulty.iter().any(|cell| cell.index() == index);
@@ -109,24 +108,24 @@ impl Sampler {
     }
 
     /// Whether a channel is lost: its latest reading is bad or stale, and its last good reading is stale. A single bad
-    /// reading does not lose a channel. Before its first reading, a channel is lost only once it is stale.
+    /// reading does not lose a channel.
     pub fn is_lost(&self, channel: Channel, now: Timestamp) -> bool {
         let is_bad = self.slot(channel).is_some_and(|slot| self.state.signals[slot].is_bad());
         is_bad && self.reported(channel, now).is_none()
     }
 
-    /// Whether the channel has a fresh good value, and a reading since the start or the last waking.
+    /// Whether there is a fresh good value, and a reading since the start or the last waking.
     pub fn is_fresh(&self, channel: Channel, now: Timestamp) -> bool {
         self.has_input_since_waking(channel) && self.reported(channel, now).is_some()
     }
 
-    /// Whether the channel's latest reading, good or bad, is older than the channel's maximum age.
+    /// Whether the latest reading, good or bad, is older than the maximum age.
     pub fn is_silent(&self, channel: Channel, now: Timestamp) -> bool {
         self.silence_s(channel, now).is_none_or(|silence_s| silence_s > limits(&self.config, channel).max_age_s)
     }
 
-    /// The longest silence of a channel (s) and the largest share of bad readings; `None` = a channel is silent, or has
-    /// no reading since the start or the last waking.
+    /// Longest silence (s) and largest share of bad readings; `None` = a channel is silent, or has no reading since the
+    /// start or the last waking.
     pub fn worst_input(&self, now: Timestamp) -> Option<(f64, f64)> {
         let began = self.state.began?;
         let (mut longest_s, mut share) = (0.0_f64, 0.0_f64);

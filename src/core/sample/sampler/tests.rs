@@ -1,4 +1,4 @@
-//! Tests scenarios of the whole sample stage; the charge counter has its own tests.
+//! Tests scenarios of the whole sample stage. The charge counter has its own tests.
 
 use proptest::prelude::*;
 
@@ -35,7 +35,6 @@ fn config() -> SampleConfig {
 const CELL: Channel = Channel::CellVoltage(CellIndex(0));
 const SENSOR: Channel = Channel::Temperature(SensorIndex(0));
 
-/// A sampler and the changes it reported.
 struct Bench {
     sampler: Sampler,
     changes: Vec<SignalChange>,
@@ -85,7 +84,7 @@ fn open_contactors_force_zero_current_and_charge() {
     bench.ok(2.0, Channel::Current, 5.0);
     let open = bench.ok(9.0, CELL, 3.7).expect("a sample");
     assert_eq!((open.current_a, open.charge_as, open.offset_s, open.unmeasured_s), (Some(0.0), 2.0, 1.0, 0.0));
-    // The contactors count as open after a bad reading, until the last good reading reaches its maximum age.
+    // After a bad reading, the contactors count as open until the last good reading is too old.
     bench.give(9.5, Channel::Contactor, Err(Fault::NotAvailable));
     let late = bench.ok(12.0, CELL, 3.7).expect("a sample");
     assert_eq!(
@@ -113,7 +112,7 @@ fn magnitude_without_valid_direction_is_unknown_current() {
     assert_eq!(current(&mut bench, 1.0, 2.0), Some(-2.0));
     bench.ok(2.0, Channel::CurrentDirection, 1.0);
     assert_eq!(current(&mut bench, 3.0, 1.5), Some(1.5));
-    // The last good current stays fresh for its maximum age; a magnitude without direction does not replace it.
+    // A magnitude without direction does not replace the last good current.
     bench.give(4.0, Channel::CurrentDirection, Err(Fault::NotAvailable));
     assert_eq!(current(&mut bench, 4.0, 9.0), Some(1.5));
     bench.ok(5.0, Channel::CurrentDirection, 1.0);
@@ -196,7 +195,7 @@ fn readings_with_equal_time_have_finite_rate() {
     assert!(bench.ok(0.0, CELL, 3.905).is_some());
 }
 
-/// Simulates current and a voltage once a second; returns the first second with a rejected voltage.
+/// Simulates a current and a voltage once a second. Returns the first second with a rejected voltage.
 fn first_stuck_second(current_a: f64, voltage: impl Fn(u32) -> f64) -> Option<u32> {
     let mut config = config();
     config.voltage.stuck_after_s = Some(60.0);
@@ -363,7 +362,7 @@ fn every_channel_has_its_own_slot() {
     assert!(slots.iter().enumerate().all(|(slot, found)| *found == Some(slot)));
 }
 
-/// A random reading, usually of a cell voltage; most readings are plausible.
+/// A random reading, usually a plausible cell voltage.
 fn reading() -> impl Strategy<Value = (Channel, Result<f64, Fault>)> {
     let volts = prop_oneof![
         8 => (0_i32..30).prop_map(|step| Ok(3.6 + 0.002 * f64::from(step))),

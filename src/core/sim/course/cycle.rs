@@ -1,13 +1,11 @@
-//! Computes the current of the scenarios that cycle between two SOC limits: `paper` (from the paper) and `reference`
-//! (from a published example).
+//! Computes the current of the scenarios `paper` and `reference`, which cycle between two SOC limits.
 
 use super::demand::Demand;
 use crate::sim::noise::Noise;
 use crate::sim::scenario::Settings;
 use crate::sim::truth::Pack;
 
-/// Range of the example's discharge pulses (A) for a cell of 30 Ah. The pulses are uniformly distributed, with a mean
-/// of 15 A.
+/// Range of the discharge pulses (A) for a cell of 30 Ah. They are uniformly distributed.
 const PULSE_A: (f64, f64) = (0.0, 30.0);
 const PULSE_S: f64 = 60.0;
 
@@ -17,7 +15,7 @@ enum Load {
     Pulses(Box<Pulses>),
 }
 
-/// A current that changes every [`PULSE_S`].
+/// A load whose current changes every [`PULSE_S`].
 #[derive(Debug, Clone)]
 struct Pulses {
     noise: Noise,
@@ -56,16 +54,14 @@ pub(crate) struct CycleCourse {
 
 impl CycleCourse {
     pub(super) fn paper(settings: &Settings, scale: f64) -> Self {
-        // Current of the paper's scenario in both directions (A) for a cell of 2.6 Ah. At this current, 48 cycles take
-        // the paper's 2.23e5 s.
+        // Current in both directions (A) for a cell of 2.6 Ah. 48 cycles then take 2.23e5 s, as in the paper.
         let current_a = 1.325 * scale;
         Self::new(settings, Load::Constant { current_a }, current_a)
     }
 
     pub(super) fn reference(settings: &Settings, scale: f64, noise: Noise) -> Self {
         let load = Pulses { noise, scale, current_a: 0.0, left_s: 0.0 };
-        // Charging current (A) for a cell of 30 Ah: 0.5 C. The published example charges with a constant current, but
-        // does not state its value.
+        // Charging current (A) for a cell of 30 Ah: 0.5 C. The published example does not state this current.
         Self::new(settings, Load::Pulses(Box::new(load)), 15.0 * scale)
     }
 
@@ -94,8 +90,8 @@ impl CycleCourse {
         Demand::Current(if self.charging { -self.charge_a } else { self.load.next_a(dt_s) })
     }
 
-    /// Whether the cycle in progress is the last cycle. The comparison with the end capacity has a tolerance of half
-    /// the loss per cycle, because 47 losses of 0.05 Ah do not add up to exactly 2.35 Ah in binary.
+    /// Whether this cycle is the last. The end capacity has a tolerance of half the loss per cycle, because of
+    /// rounding: 47 losses of 0.05 Ah do not add up to exactly 2.35 Ah.
     fn is_last_cycle(&self, pack: &Pack) -> bool {
         self.cycles.is_some_and(|cycles| pack.cycles() + 1 >= cycles)
             || pack.lowest_capacity_ah() - 0.5 * self.loss_ah < self.end_capacity_ah

@@ -1,12 +1,10 @@
-//! Defines what a simulated scenario demands next: a current until the next sample, a sleep of the vehicle, or the end
-//! of the scenario.
+//! Defines the demand of a simulated scenario: a current, a sleep, or the end.
 
-/// What a scenario demands next.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Demand {
     /// This cell current (A) flows until the next sample; positive = discharge.
     Current(f64),
-    /// The vehicle sleeps: no current, no measurements.
+    /// The vehicle sleeps, without current and measurements.
     Asleep {
         duration_s: f64,
     },

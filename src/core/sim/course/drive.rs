@@ -1,8 +1,8 @@
 //! Computes the current of the scenario `ev-day`: a day of an electric car with drives, sleep while parked, and a fast
 //! charge.
 //!
-//! The car is a point mass that follows random target speeds with bounded acceleration. The electric power is scaled
-//! from a 60 kWh car to the simulated pack, so that the cells have the same C-rate as the cells of that car.
+//! The car is a point mass that follows random target speeds with bounded acceleration. The power of a 60 kWh car is
+//! scaled to the simulated pack, so that the cells have the C-rate of that car.
 
 use super::demand::Demand;
 use crate::quantity::DAY_S;
@@ -10,17 +10,15 @@ use crate::sim::noise::Noise;
 use crate::sim::truth::Pack;
 
 const AUXILIARY_W: f64 = 600.0;
-/// Largest acceleration and deceleration, m/s^2.
+/// Largest acceleration and deceleration (m/s^2).
 const ACCELERATION_M_S2: (f64, f64) = (1.2, 1.5);
-/// Largest currents that the power electronics allow during regeneration and during traction, C.
+/// Largest currents during regeneration and during traction (C).
 const CURRENT_LIMIT_C: (f64, f64) = (0.8, 2.5);
-/// SOC at which fast charging ends.
 const CHARGE_TO_SOC: f64 = 0.80;
-/// Fast charging current, C: the first value applies up to SOC 0.4; from there, the current falls linearly to the
+/// Fast charging current (C). The first value applies up to SOC 0.4. From there, the current falls linearly to the
 /// second value at SOC 0.8.
 const CHARGE_C: (f64, f64) = (1.5, 0.6);
 
-/// One part of the day.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum DayPhase {
     Drive {
@@ -33,7 +31,7 @@ enum DayPhase {
     FastCharge,
 }
 
-/// Plan of a day that starts at 7:30: drive to work, drive back at 17:00 with a stop at the charger, park overnight.
+/// A day from 7:30: drive to work, drive back at 17:00 with a stop at the charger, park overnight.
 const DAY: [DayPhase; 6] = [
     DayPhase::Drive { left_s: 3300.0 },
     DayPhase::Park { until_s: 9.5 * 3600.0 },
@@ -43,7 +41,7 @@ const DAY: [DayPhase; 6] = [
     DayPhase::Park { until_s: DAY_S },
 ];
 
-/// Repeated days; each completed day counts as a cycle.
+/// Repeated days. Each completed day counts as a cycle.
 #[derive(Debug, Clone)]
 pub(crate) struct DayCourse {
     plan: usize,
@@ -62,7 +60,7 @@ impl DayCourse {
     }
 
     pub(super) fn next(&mut self, pack: &mut Pack, dt_s: f64) -> Demand {
-        // Below an SOC of 10 %, a drive ends early and the car charges.
+        // If a drive empties the pack below SOC 10 %, the drive ends early, and the car charges.
         if matches!(self.phase, DayPhase::Drive { .. }) && pack.lowest_soc() < 0.10 {
             self.phase = DayPhase::FastCharge;
         }
@@ -82,7 +80,7 @@ impl DayCourse {
                 Demand::Current(self.charge_a(pack))
             }
             DayPhase::Park { until_s } => {
-                // If drives and charges took longer than planned, the car still sleeps for 60 s.
+                // The car sleeps for at least 60 s, even if drives and charges took longer than planned.
                 let duration_s = (until_s - self.day_s).max(60.0);
                 self.day_s += duration_s;
                 self.advance_plan(pack);
@@ -107,18 +105,18 @@ impl DayCourse {
 
     fn drive_a(&mut self, pack: &Pack, dt_s: f64) -> f64 {
         if self.hold_s <= 0.0 {
-            // Target speeds, km/h: town, country road, motorway.
+            // Target speeds (km/h) in town, on country roads and on the motorway.
             self.target_m_s = self.noise.choose(&[0.0, 30.0, 50.0, 50.0, 70.0, 90.0, 110.0, 120.0]) / 3.6;
             self.hold_s = self.noise.between(15.0, 120.0);
         }
         self.hold_s -= dt_s;
-        let wanted = (self.target_m_s - self.speed_m_s) / dt_s.max(1.0); // a small difference is closed over 1 s
+        let wanted = (self.target_m_s - self.speed_m_s) / dt_s.max(1.0); // closes a small speed difference in 1 s
         let acceleration = wanted.clamp(-ACCELERATION_M_S2.1, ACCELERATION_M_S2.0);
         self.speed_m_s = (self.speed_m_s + acceleration * dt_s).max(0.0);
-        // `power_w` returns the power of a car whose pack has 60,000 Wh.
+        // `power_w` applies to a car with a 60,000 Wh pack.
         let capacities_per_hour = power_w(self.speed_m_s, acceleration) / 60_000.0;
         let (lowest_v, highest_v) = pack.extremes_v(0.0);
-        // 3.65 V is the nominal voltage of the cells of the 60 kWh car.
+        // The cells of the 60 kWh car have a nominal voltage of 3.65 V.
         let current_c = capacities_per_hour * 3.65 / (0.5 * (lowest_v + highest_v));
         let current_a = self.capacity_ah * current_c.clamp(-CURRENT_LIMIT_C.0, CURRENT_LIMIT_C.1);
         if current_a > 0.0 {
@@ -140,10 +138,9 @@ fn power_w(speed_m_s: f64, acceleration_m_s2: f64) -> f64 {
     if speed_m_s == 0.0 {
         return AUXILIARY_W;
     }
-    // The mass is 1900 kg including two people. The rolling resistance is 1 % of the weight. The other factors are air
-    // density, drag coefficient and frontal area.
+    // The mass is 1900 kg with two people. The rolling resistance is 1 % of the weight. The last factor is half of the
+    // air density, times the drag coefficient, times the frontal area.
     let force_n = 1900.0 * (acceleration_m_s2 + 9.81 * 0.010) + (0.5 * 1.2 * 0.25 * 2.3) * speed_m_s * speed_m_s;
     let wheel_w = force_n * speed_m_s;
-    // Efficiency from battery to wheel, and from wheel to battery.
     AUXILIARY_W + if wheel_w > 0.0 { wheel_w / 0.90 } else { wheel_w * 0.70 }
 }

@@ -8,7 +8,7 @@ use crate::sim::truth::Pack;
 
 /// Load currents (A) for a cell of 2.1 Ah.
 const LOADS_A: [f64; 12] = [-4.5, -3.75, -3.0, -2.25, -1.5, -0.75, 0.75, 1.5, 2.25, 3.0, 3.75, 4.5];
-/// Voltage range of the walk (V) (narrowed to the cell's own limits).
+/// Voltage range of the loads (V), narrowed to the cell's own limits.
 const RANGE_V: (f64, f64) = (3.2, 4.2);
 /// Reference current in both directions (A) for a cell of 2.1 Ah.
 const REFERENCE_A: f64 = 2.0;
@@ -23,7 +23,7 @@ enum WalkPhase {
     Rest { is_full: bool, cycles_left: u32, left_s: f64 },
 }
 
-/// Blocks of random loads, each followed by reference cycles. A block with its reference cycles counts as one cycle.
+/// Blocks of random loads. A block and the reference cycles after it count as one cycle.
 #[derive(Debug, Clone)]
 pub(crate) struct WalkCourse {
     phase: WalkPhase,
@@ -57,7 +57,7 @@ impl WalkCourse {
                     return Demand::Current(current_a);
                 }
                 if steps_left == 0 {
-                    // Reference cycles after each block of loads.
+                    // Two reference cycles follow each block of loads.
                     return self.enter(WalkPhase::Charge { cycles_left: 2 }, pack, dt_s);
                 }
                 let current_a = self.draw_load(pack, low_v, high_v);
@@ -67,7 +67,7 @@ impl WalkCourse {
             }
             WalkPhase::Charge { cycles_left } => {
                 let current_a = pack.current_at_highest_a(high_v).max(-REFERENCE_A * self.scale);
-                // Charging at constant voltage ends at this current (A) for a cell of 2.1 Ah.
+                // Charging at constant voltage ends at this current (A, for a cell of 2.1 Ah).
                 if current_a > -0.05 * self.scale {
                     let rest = WalkPhase::Rest { is_full: true, cycles_left, left_s: REST_S };
                     return self.enter(rest, pack, dt_s);
@@ -109,8 +109,7 @@ impl WalkCourse {
     }
 
     fn draw_load(&mut self, pack: &Pack, low_v: f64, high_v: f64) -> f64 {
-        // Draws at most 32 loads until one stays within the voltage range. If all leave the range, the pack rests. Six
-        // of the 12 loads are positive and six are negative.
+        // Tries up to 32 random loads. If none stays within the voltage range, the pack rests.
         (0..32)
             .map(|_| self.scale * self.noise.choose(&LOADS_A))
             .find(|&a| pack.lowest_v(a) > low_v && pack.highest_v(a) < high_v)

@@ -1,7 +1,7 @@
 //! Parses the text form of a fault: `KIND:...@WHEN`.
 //!
-//! WHEN is `day3` or `3d` (three days after the start), `12h` or `900s`. Without `@WHEN`, the fault starts with the
-//! simulation.
+//! WHEN is `day3` or `3d` (three days after the start), `12h` or `900s`. Without `@WHEN`, the fault starts at the start
+//! of the simulation.
 
 use std::str::FromStr;
 
@@ -68,7 +68,7 @@ fn parse_kind(text: &str) -> Result<FaultKind, FaultError> {
     })
 }
 
-/// Parses a number that counts from 1; returns it as an index from 0.
+/// Parses a number that counts from 1 into an index that counts from 0.
 fn number(what: &'static str, text: &str) -> Result<u16, FaultError> {
     let number = text.parse::<u16>().ok().filter(|n| (1..=MAX_CELLS).contains(&usize::from(*n)));
     number.map(|n| n - 1).ok_or_else(|| FaultError::new(what, text, format!("a number from 1 to {MAX_CELLS}")))
@@ -125,7 +125,7 @@ fn quantity(what: &'static str, text: &str, units: &[Unit], limit: f64) -> Resul
     })
 }
 
-/// Parses a finite number followed by one of `units`; returns it in the base unit.
+/// Parses a finite number followed by one of `units`. Returns it in the base unit.
 fn measured(text: &str, units: &[Unit]) -> Option<f64> {
     let (number, factor) = units.iter().find_map(|(unit, factor)| Some((text.strip_suffix(unit)?, factor)))?;
     let number = number.parse::<f64>().ok().filter(|x| x.is_finite())?;

@@ -1,18 +1,17 @@
-//! Applies sensor faults to true values before the measurement, and to readings after the measurement.
+//! Applies sensor faults to true values before a measurement, and to readings after it.
 
 use super::FaultKind;
 use crate::quantity::{Channel, SensorIndex};
 
-/// The sensor faults that have started.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct SensorFaults {
     begun: Vec<FaultKind>,
-    /// Value of each frozen channel; `None` = no reading since the start of the fault.
+    /// The frozen channels with their values; `None` = no reading since the start of the fault.
     frozen: Vec<(Channel, Option<f64>)>,
 }
 
 impl SensorFaults {
-    /// Starts a fault; faults of cells have no effect here.
+    /// Starts a fault. Faults of cells have no effect here.
     pub(crate) fn begin(&mut self, fault: FaultKind) {
         let frozen = match fault {
             FaultKind::CurrentStuck => Some(Channel::Current),
@@ -32,12 +31,11 @@ impl SensorFaults {
         })
     }
 
-    /// The temperature at `sensor` (degrees C).
     pub(crate) fn temperature_c(&self, sensor: SensorIndex, truth_c: f64, ambient_c: f64) -> f64 {
         if self.begun.contains(&FaultKind::TemperatureOff(sensor)) { ambient_c } else { truth_c }
     }
 
-    /// Changes the voltages at the cells' taps to the voltages at the channels (V): adds offsets and swaps channels.
+    /// Converts the voltages at the cells' taps into the voltages at the channels (V): adds offsets and swaps channels.
     pub(crate) fn distort_voltages(&self, voltages_v: &mut [f64]) {
         for fault in &self.begun {
             match *fault {

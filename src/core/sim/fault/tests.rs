@@ -1,4 +1,4 @@
-//! Tests the text forms of faults, and the effects of faults on true state and readings.
+//! Tests the text forms of faults, and their effects on true state and readings.
 
 use super::super::truth::tests::{plain_model, plain_settings};
 use super::super::{Balancing, Moment, Scenario, SensorQuality, Sensors, Settings, Simulation, Wiring};
@@ -9,8 +9,7 @@ fn fault(text: &str) -> Fault {
     text.parse().unwrap_or_else(|error| panic!("{text}: {error}"))
 }
 
-/// Four equal cells with ideal sensors. The current is 1.325 A in both directions, and temperature sensor 1 is on cell
-/// 1.
+/// Four equal cells with ideal sensors, at 1.325 A in both directions. Temperature sensor 1 is on cell 1.
 fn settings() -> Settings {
     let mut settings = Settings::of(Scenario::Paper, 2.6);
     settings.pack = crate::sim::PackSettings { cells: 4, ..plain_settings() };
@@ -36,7 +35,6 @@ fn voltage_v(sim: &Simulation, cell: u16) -> f64 {
     reading(sim, Channel::CellVoltage(CellIndex(cell)))
 }
 
-/// Runs a pack with `faults` and a pack without faults; calls `each` with both packs at each moment.
 fn compare(faults: &[&str], mut each: impl FnMut(Moment, &Simulation, &Simulation)) -> (Simulation, Simulation) {
     let (mut faulty, mut healthy) = (simulation(faults), simulation(&[]));
     while let Some((moment, _)) = faulty.advance().zip(healthy.advance()) {
@@ -130,7 +128,7 @@ fn leak_discharges_cell_while_buses_sleep() {
         end_s = moment.time.secs();
     }
     let cells = sim.pack().cells();
-    // The simulation ends with a night, which has no sampling moments.
+    // The simulation ends with a night, in which nothing is sampled.
     assert!(end_s < 80_000.0);
     assert!(
         ((cells[0].soc - cells[1].soc) * 2.6 - 0.01 * 22.0).abs() < 1e-3,
@@ -165,7 +163,7 @@ fn weak_and_resistive_cells_keep_their_soc() {
     let cells = faulty.pack().cells();
     assert!((cells[1].capacity_ah - 2.34).abs() < 1e-12 && cells[0].capacity_ah == 2.6);
     assert!((cells[2].resistance_ratio - 1.2).abs() < 1e-12 && cells[1].resistance_ratio == 1.0);
-    // The two states are one step of a second apart.
+    // The two states are one step (1 s) apart.
     assert!((before[1] - at[1] - (before[0] - at[0])).abs() < 1e-12);
 }
 
@@ -179,8 +177,8 @@ fn replaced_module_has_new_cells_of_equal_soc() {
         assert_eq!((cell.resistance_ratio, cell.leak, cell.soc), (1.0, None, cells[1].soc));
     }
     assert_eq!(cells[3], healthy.pack().cells()[3]);
-    // The new module starts with the mean SOC of the old module, so the new module lacks half of the leaked charge.
-    // With 15 % more capacity, the SOC of the new module then falls less.
+    // The new module starts with the mean SOC of the old module, so it lacks half of the leaked charge. Its SOC then
+    // falls more slowly, because it has 15 % more capacity.
     let missing = healthy.pack().cells()[3].soc - cells[1].soc;
     let moved = 1.325 * 1000.0 / 3600.0 / 2.6;
     let expected = 0.5 * 0.5 * 2000.0 / 3600.0 / 2.6 - moved * (1.0 - 1.0 / 1.15);
@@ -289,6 +287,6 @@ fn sensor_quality_limits_errors_and_quantises_readings() {
         }
     }
     let rms_v = (errors_v.iter().map(|v| v * v).sum::<f64>() / 400.0).sqrt();
-    assert!((0.004..0.0055).contains(&rms_v), "{rms_v}"); // clipping at 2 sigma leaves 0.96 of 5 mV
+    assert!((0.004..0.0055).contains(&rms_v), "{rms_v}"); // the limit of 2 sigma reduces 5 mV by the factor 0.96
     assert!(errors_v.iter().all(|v| v.abs() < 0.0115));
 }

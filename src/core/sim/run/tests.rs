@@ -54,7 +54,7 @@ fn run(sim: &mut Simulation) -> Course {
 fn paper_scenario_matches_time_and_final_capacity() {
     let mut sim = simulation(Settings::of(Scenario::Paper, 2.6));
     let course = run(&mut sim);
-    assert_eq!(sim.pack().cycles(), 47); // the 48th cycle, at 0.25 Ah, is the last one and loses no capacity
+    assert_eq!(sim.pack().cycles(), 47); // the 48th cycle ends at 0.25 Ah and is not completed
     assert!((sim.pack().lowest_capacity_ah() - 0.25).abs() < 1e-9);
     assert!((course.end_s / 2.23e5 - 1.0).abs() < 0.01, "{} s", course.end_s);
     let one_sample = 1.325 / (3600.0 * 0.25);
@@ -94,7 +94,7 @@ fn ev_day_drives_regenerates_sleeps_and_charges() {
     settings.pack.cells = 3;
     let mut sim = simulation(settings);
     let course = run(&mut sim);
-    assert_eq!(course.longest_gap_s.round(), 9.5 * 3600.0 - 3300.0); // no moment follows the night
+    assert_eq!(course.longest_gap_s.round(), 9.5 * 3600.0 - 3300.0); // no sample follows the night
     assert_eq!(sim.pack().cycles(), 1);
     assert!(course.soc.0 > 0.3 && course.soc.1 < 0.88, "{:?}", course.soc);
     assert!(course.current_a.1 > 50.0 && course.current_a.0 < -20.0, "{:?}", course.current_a);
@@ -111,7 +111,7 @@ fn sleeping_bms_reports_bits_while_bleeding() {
     (settings.cycles, settings.duration_s) = (Some(2), Some(100_000.0));
     (settings.current_period_ns, settings.cell_period_ns) = (1_000_000_000, 1_000_000_000);
     let mut nights = 0;
-    // With some seeds, the drive home includes a stop, which counts as the rest after the charge.
+    // With some seeds, the car stops on the drive home. This stop counts as the rest after the charge.
     for seed in 1..=20 {
         settings.seed = seed;
         let run = |has_bits: bool| {

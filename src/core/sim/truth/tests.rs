@@ -3,7 +3,6 @@
 use super::*;
 use crate::cell::{Branch, Table, Thermal};
 
-/// A cell with constant resistances, so that closed-form solutions hold for any change of SOC.
 pub(crate) fn plain_model(capacity_ah: f64) -> CellModel {
     let k = capacity_ah / 2.6;
     let flat = |value: f64| Table { values: vec![vec![value; 5]] };
@@ -62,7 +61,7 @@ fn temperature_settles_where_losses_equal_cooling() {
     for i in 0..20_000 {
         pack.step(if i % 2 == 0 { 3.0 } else { -3.0 }, 1.0);
     }
-    let losses_w = 9.0 * 0.03; // with alternating current, the branch voltage stays near 0
+    let losses_w = 9.0 * 0.03; // the alternating current keeps the branch voltage near 0
     assert!((pack.cells()[0].temperature_c - (25.0 + 8.0 * losses_w)).abs() < 0.01);
 }
 

@@ -1,16 +1,13 @@
 //! Finds cells whose voltages are always the same: one signal is configured for two cells, or a cell's value is copied.
 //!
 //! In: for each block of time, the mean voltage of each cell (V). Out: groups of cells that never differed, each with
-//! the number of blocks in which the cells' voltages changed. Equality is exact: a copy has the same digits, while two
-//! cells in series differ at least in the last digit.
+//! the number of blocks in which the voltages changed. Equality is exact, because a copy has the same digits, while
+//! two cells in series differ at least in the last digit.
 
-/// Groups of cells that have never differed.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct EqualCells {
-    /// Group number by cell.
     groups: Vec<usize>,
     last_v: Vec<f64>,
-    /// For each cell, the number of blocks in which its voltage changed.
     changes: Vec<u32>,
 }
 
@@ -32,7 +29,6 @@ impl EqualCells {
         self.split();
     }
 
-    /// Splits groups whose cells now differ.
     fn split(&mut self) {
         let key = |cell: &usize| (self.groups[*cell], self.last_v[*cell].to_bits());
         let mut order: Vec<usize> = (0..self.groups.len()).collect();

@@ -1,4 +1,4 @@
-//! Derives evidence about a signal from the signal's name and unit.
+//! Derives evidence about what a signal measures from its name and unit.
 //!
 //! In: message name, signal name and unit as written in the DBC. Out: points for each quantity of a pack, with their
 //! reasons in words, or `None` if the name or the unit excludes the quantity. The points are weights that were chosen
@@ -30,8 +30,7 @@ pub enum PackQuantity {
 /// Points for a quantity, with their reasons.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Score {
-    /// Weight of the evidence. The number has no physical meaning: it ranks signals, and callers compare it with a
-    /// threshold.
+    /// Weight of the evidence, without a physical meaning. It ranks signals, and callers compare it with a threshold.
     pub points: f64,
     /// Reasons in plain words.
     pub reasons: Vec<String>,
@@ -42,18 +41,15 @@ pub struct Score {
 pub struct SignalLabel {
     /// Words of the signal's name, lower case; split at changes of case, at digits and at punctuation.
     words: Vec<String>,
-    /// The whole name, lower case.
     name: String,
     unit: LabelUnit,
     is_pack_message: bool,
     is_low_voltage_message: bool,
 }
 
-/// The unit of a label.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum LabelUnit {
     Known(Quantity),
-    /// No unit is stated.
     Missing,
     /// A unit is stated but not known.
     Other,
@@ -117,7 +113,6 @@ impl PackQuantity {
         }
     }
 
-    /// The physical quantity that a signal of this kind measures.
     fn measured(self) -> Quantity {
         match self {
             Self::Current => Quantity::Current,
@@ -158,7 +153,6 @@ impl SignalLabel {
         }
     }
 
-    /// Whether the name contains one of the words.
     fn has(&self, any: &str) -> bool {
         any.split(' ').any(|wanted| match wanted.strip_prefix('=') {
             Some(word) => self.words.iter().any(|own| own == word),
@@ -230,7 +224,8 @@ impl SignalLabel {
             PackQuantity::Soc => (self.says_soc() && !self.says_soh(), "its name says state of charge"),
             PackQuantity::Soh => (self.says_soh(), "its name says state of health"),
         };
-        // Points of unit and name, and whether the name must match even if a unit is stated.
+        // Points for a matching unit, points for a matching name, and whether the name must match even if a unit is
+        // stated.
         let (unit_points, name_points, needs_name) = match quantity {
             PackQuantity::Current | PackQuantity::PackVoltage => (2.0, 2.0, false),
             PackQuantity::CellVoltage => (1.0, 2.0, true),

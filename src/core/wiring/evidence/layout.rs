@@ -1,4 +1,5 @@
-//! Reads a signal with another byte order, start bit or sign of the number.
+//! Reads a signal with an alternative layout: another byte order, start bit or sign. If the alternative gives better
+//! values, the layout in the DBC may be wrong.
 
 use super::sample::Extent;
 use crate::can::signal::{ByteOrder, SignalLayout, SignalPlan, ValueType};
@@ -12,10 +13,8 @@ pub(crate) const LAYOUT_FAULTS: [&str; 5] = [
     "wrong byte order and sign of the number (the start bit is right)",
 ];
 
-/// A signal read with another layout.
 #[derive(Debug, Clone)]
 pub(crate) struct AlternativeReading {
-    /// One of [`LAYOUT_FAULTS`].
     pub(crate) fault: &'static str,
     pub(crate) layout: SignalLayout,
     plan: SignalPlan,
@@ -23,7 +22,6 @@ pub(crate) struct AlternativeReading {
 }
 
 impl AlternativeReading {
-    /// All alternative readings of a signal.
     pub(super) fn all(layout: &SignalLayout) -> Vec<Self> {
         let other_sign = |layout: SignalLayout| match layout.value_type {
             ValueType::Unsigned => Some(SignalLayout { value_type: ValueType::Signed, ..layout }),
@@ -42,7 +40,6 @@ impl AlternativeReading {
         LAYOUT_FAULTS.into_iter().zip(others).filter_map(reading).collect()
     }
 
-    /// Reads the signal from a payload.
     pub(super) fn handle(&mut self, payload: &[u8], scale: f64, offset: f64) {
         if let Ok(physical) = self.plan.physical(payload) {
             self.extent.push(physical * scale + offset);

@@ -1,13 +1,12 @@
 //! Counts missing frames of a cyclic signal.
 //!
-//! In: times between two readings (gaps) (s). Out: the share of missing readings. The cycle is the median of the first
-//! gaps. After these, a gap of n cycles counts as n - 1 missing readings. The total is limited to the elapsed cycles
-//! minus the received readings. Readings that a sender delays and then sends in a burst therefore do not count as
-//! missing. If the gaps are not multiples of one value, the sender has no cycle and the share is unknown.
+//! In: gaps, that is, times between two readings (s). Out: the share of missing readings. The median of the first
+//! gaps is the cycle. A later gap of n cycles counts as n - 1 missing readings. The total is limited to the elapsed
+//! cycles minus the received readings, so that readings sent late in a burst do not count as missing. If the gaps are
+//! not multiples of one value, the sender has no cycle and the share is unknown.
 
 use crate::filter::median;
 
-/// Counts of one signal.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct LossCounter {
     first: Vec<f64>,
@@ -29,7 +28,7 @@ impl LossCounter {
             return;
         };
         let cycles = gap_s / cycle_s;
-        // A longer gap is a pause.
+        // Skip pauses of the sender.
         if cycles > 5.5 {
             return;
         }
@@ -72,7 +71,7 @@ mod tests {
     fn jitter_and_pauses_do_not_count_as_loss() {
         let jitter = share((0..700).map(|n| 0.01 + 0.002 * f64::from(n % 3 - 1)));
         assert!(jitter.is_some_and(|share| share < 0.01), "{jitter:?}");
-        // A busy computer sends two frames late and catches up.
+        // A busy computer delays two frames and then sends them in a burst.
         let late = share((0..700).map(|n| match n % 15 {
             7 => 0.03,
             8 | 9 => 0.0001,

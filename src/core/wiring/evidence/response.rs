@@ -6,8 +6,8 @@
 //! * runs of steady current with the drift of the voltage: dV = -(dOCV/dSOC) I t / C;
 //! * rests: runs with a current near zero.
 //!
-//! Only the largest current steps and the longest runs are kept. This selection does not bias the slope, because the
-//! selection does not depend on the voltages.
+//! Only the largest current steps and the longest runs are kept. Choosing by current and duration does not bias the
+//! slope, because the choice does not depend on the voltages.
 
 use super::equal_cells::EqualCells;
 use super::slope::Slope;
@@ -17,10 +17,9 @@ use crate::quantity::Timestamp;
 /// Block lengths over which readings are averaged (s). Short blocks suit a load that changes all the time. Long blocks
 /// suit noisy voltages and a load that holds for a while.
 pub(crate) const BLOCKS_S: [f64; 2] = [1.0, 10.0];
-/// Two blocks, or a current and a voltage, are compared only if the time between them is at most this (s).
+/// Maximum time between two compared blocks, and between a current and the voltage compared with it (s).
 const MAX_GAP_S: f64 = 40.0;
 
-/// A step of the current and of the voltages.
 #[derive(Debug, Clone)]
 struct CurrentStep {
     current_a: f64,
@@ -28,7 +27,6 @@ struct CurrentStep {
     cells_v: Vec<f32>,
 }
 
-/// A period of steady current.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct SteadyRun {
     pub(crate) current_a: f64,
@@ -38,13 +36,10 @@ pub(crate) struct SteadyRun {
     pub(crate) voltage_v: f64,
     /// Drift over `seconds` (V).
     pub(crate) drift_v: f64,
-    /// Standard deviation of `drift_v` (V).
     pub(crate) drift_std_v: f64,
-    /// Voltage at the end (V).
     pub(crate) end_v: f64,
 }
 
-/// Sums of the readings of one block.
 #[derive(Debug, Clone, Default)]
 struct Block {
     from: Option<Timestamp>,
@@ -53,7 +48,6 @@ struct Block {
     cells: Vec<(f64, u32)>,
 }
 
-/// Means of a complete block.
 #[derive(Debug, Clone)]
 struct BlockMean {
     time: Timestamp,
@@ -62,7 +56,7 @@ struct BlockMean {
     cells_v: Vec<f64>,
 }
 
-/// A run that is still growing. The sums count time and voltage from the first evaluated block, so that rounding errors
+/// A run that is still growing. Time and voltage are relative to the first evaluated block, so that rounding errors
 /// stay small.
 #[derive(Debug, Clone, Copy, Default)]
 struct OpenRun {
@@ -91,7 +85,7 @@ impl OpenRun {
         self.current_sum += mean.current_a;
         self.blocks += 1;
         let t = mean.time.since(self.from);
-        // Skips the time in which the circuit's branches settle.
+        // Skip the time in which the slow overvoltages of the cell settle.
         if t < 20.0 {
             return;
         }
@@ -102,7 +96,6 @@ impl OpenRun {
         (self.v, self.vv, self.tv) = (self.v + v, self.vv + v * v, self.tv + t * v);
     }
 
-    /// Fits a line to the evaluated part of the run; `None` if this part is too short.
     fn finish(&self) -> Option<SteadyRun> {
         let (n, (first_s, first_v)) = (self.n, self.first?);
         let seconds = self.last.since(self.from) - first_s;
@@ -136,9 +129,8 @@ pub(crate) struct VoltageResponse {
     previous: Option<BlockMean>,
     open_run: Option<OpenRun>,
     steps: Vec<CurrentStep>,
-    /// Largest absolute current of a block (A).
     largest_a: f64,
-    /// The largest absolute voltage steps (V), whatever the current did, largest first.
+    /// The three largest absolute voltage steps (V), largest first, regardless of the current.
     voltage_steps_v: [f64; 3],
     pub(crate) runs: Vec<SteadyRun>,
     pub(crate) rests: Vec<SteadyRun>,
@@ -182,7 +174,7 @@ impl VoltageResponse {
     }
 
     /// Closes the open block of readings and the open run of steady current. The observer calls this function at each
-    /// gap in the observation, and at the end of the observation.
+    /// gap and at the end of the observation.
     pub(crate) fn pause(&mut self) {
         self.close_block();
         self.close_run();
@@ -251,7 +243,6 @@ impl VoltageResponse {
         }
     }
 
-    /// Block length over which readings are averaged (s).
     pub(crate) fn block_s(&self) -> f64 {
         self.block_s
     }
@@ -266,13 +257,12 @@ impl VoltageResponse {
         self.slope_over(|step| step.cells_v.get(cell).map(|v| f64::from(*v)))
     }
 
-    /// Slope from the steps that are at least a fifth as large as the largest step, because smaller steps are mostly
-    /// noise. If there are fewer than five such steps, the smaller steps are included, because they show how large the
-    /// noise is.
+    /// Slope from the current steps that are at least a fifth of the largest step, because smaller steps are mostly
+    /// noise. If there are fewer than five such steps, all steps are used, because the small steps show the noise.
     fn slope_over(&self, voltage_v: impl Fn(&CurrentStep) -> Option<f64>) -> Option<Slope> {
         let largest = self.steps.iter().map(|step| step.current_a.abs()).fold(0.0, f64::max);
-        // A charger of constant power, or one that tapers, changes the current slowly as the voltage rises: then the
-        // voltage drives the current.
+        // A charger with constant power or a tapering current lowers the current slowly as the voltage rises. Then
+        // the voltage drives the current, so the steps do not show a resistance.
         if largest < 0.05 * self.largest_a {
             return None;
         }
@@ -284,8 +274,8 @@ impl VoltageResponse {
             return Slope::of(points(0.2 * largest));
         }
         let all: Vec<(f64, f64)> = points(0.0).collect();
-        // Exception: the largest step is small for this pack, so the steps are either noise or in a wrong unit. In that
-        // case, use only the steps of at least a fifth of the largest step, without outliers.
+        // Exception: if the largest step is small for this pack, the steps are noise or in a wrong unit. Then use
+        // only the steps that are at least a fifth of the largest step, without outliers.
         if largest < 5.0 * self.tolerance_a { Slope::of(points(0.2 * largest)) } else { Slope::fit(&all) }
     }
 
@@ -294,7 +284,7 @@ impl VoltageResponse {
         self.voltage_steps_v[0]
     }
 
-    /// Third largest step of the median cell's voltage (V): one wrong reading makes two steps.
+    /// Third largest step of the median cell's voltage (V). A wrong reading can cause the two larger steps.
     pub(crate) fn large_voltage_step(&self) -> f64 {
         self.voltage_steps_v[2]
     }

@@ -1,9 +1,8 @@
-//! Keeps the extent of a stream of values, its roughness (mean absolute change from value to value) and a thinned
-//! sample of the stream, in bounded memory.
+//! Keeps statistics of a stream of values in bounded memory: extent, roughness (mean absolute change from value to
+//! value) and a thinned sample.
 
-/// A sample of a stream. The sample keeps every value until it is full, then every second value, every fourth, and so
-/// on. If two samples have the same maximum size and receive the same number of values, they keep the values at the
-/// same positions.
+/// A sample of a stream. It keeps every value until it is full, then every second value, then every fourth, and so
+/// on. If two samples have the same maximum size and receive the same number of values, they keep the same positions.
 #[derive(Debug, Clone)]
 pub struct ThinnedSample {
     values: Vec<f64>,
@@ -20,7 +19,6 @@ impl Default for ThinnedSample {
 }
 
 impl ThinnedSample {
-    /// A sample of exactly these values.
     pub(super) fn of(values: Vec<f64>) -> Self {
         Self { most: values.len(), seen: values.len() as u64, stride: 1, values }
     }
@@ -51,7 +49,7 @@ impl ThinnedSample {
         self.seen += 1;
     }
 
-    /// The value below which a share `q` of the values lies; `None` without values.
+    /// The value below which the share `q` of the values lies; `None` without values.
     pub(crate) fn quantile(&self, q: f64) -> Option<f64> {
         let mut sorted = self.values.clone();
         sorted.sort_by(f64::total_cmp);
@@ -63,7 +61,7 @@ impl ThinnedSample {
         self.quantile(0.5)
     }
 
-    /// Share of the values that fulfil `has`; 0 without values.
+    /// Share of the values for which `has` is true; 0 without values.
     pub(crate) fn share(&self, has: impl Fn(f64) -> bool) -> f64 {
         self.values.iter().filter(|value| has(**value)).count() as f64 / self.values.len().max(1) as f64
     }

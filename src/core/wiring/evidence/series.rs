@@ -1,8 +1,8 @@
-//! Statistics of one signal: counts, periods, extent and roughness of its values. The extent is also kept for other
-//! layouts of the signal.
+//! Statistics of one signal: counts, periods, extent and roughness of its values. The extent is also kept for
+//! alternative layouts of the signal (byte order, start bit, sign).
 //!
-//! In: payloads or values with their time. Values are in the program's unit, after the configured scale and offset. No
-//! limits are applied. Memory is bounded: gaps and values are kept as thinned samples.
+//! In: payloads or values with their time. Values are in the program's unit, after the configured scale and offset,
+//! without range limits. Memory is bounded, because gaps and values are kept as thinned samples.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -21,14 +21,14 @@ pub struct UnusableCounts {
     pub(crate) not_finite: u64,
 }
 
-/// Shortest missing stretch of a signal (s), and its shortest length in periods of the signal.
+/// A gap is a missing stretch if it is longer than `MISSING_S` seconds and longer than `MISSING_PERIODS` periods of
+/// the signal.
 const MISSING_S: f64 = 60.0;
 const MISSING_PERIODS: f64 = 20.0;
 
 /// Statistics of one signal.
 #[derive(Debug, Clone, Default)]
 pub struct Series {
-    /// Frames with the signal's identifier.
     pub(crate) frames: u64,
     pub(crate) unusable: UnusableCounts,
     /// Number of values outside `plausible`.
@@ -38,21 +38,16 @@ pub struct Series {
     pub extent: Extent,
     /// A sample of the values.
     pub values: ThinnedSample,
-    /// The times of the values in `values` (s).
     pub(super) times_s: ThinnedSample,
-    /// Time between two readings (s).
     pub(crate) gaps: ThinnedSample,
     pub(crate) loss: LossCounter,
-    /// Longest gap that is not a missing stretch (s).
+    /// Longest gap, without missing stretches (s).
     pub(crate) longest_gap_s: f64,
     /// Longest missing stretch: begin and length (s).
     pub(crate) longest_missing: Option<(Timestamp, f64)>,
-    /// Sum of the missing stretches (s).
     pub(crate) missing_s: f64,
-    /// Number of gaps that are longer than `max_age_s` and not missing stretches: a reading became stale before the next
-    /// reading.
+    /// Number of gaps longer than `max_age_s`, without missing stretches. In each of them, a reading became stale.
     pub(crate) stale_gaps: u64,
-    /// Absolute changes from one value to the next.
     pub(crate) changes: ThinnedSample,
     /// Number of changes that are too fast for a temperature.
     pub(crate) jumps: u64,
@@ -83,9 +78,9 @@ impl Series {
 
     /// Creates the statistics of a recorded signal from its values and their times (s).
     pub fn of(readings: impl Iterator<Item = (f64, Result<f64, Fault>)>) -> Self {
-        // 4096 values suffice for a correlation, and samples of this size fit into memory for thousands of signals.
+        // 4096 values suffice for a correlation. Samples of this size fit into memory for thousands of signals.
         const MOST: usize = 4096;
-        // A load changes within some tenths of a second.
+        // Short enough to show the load changes, which take some tenths of a second.
         const FINE_S: f64 = 0.5;
         let mut series = Self::default();
         let mut all = Vec::new();
@@ -109,7 +104,6 @@ impl Series {
         if self.extent.count > 0 {
             let change = (value - self.extent.last).abs();
             self.changes.push(change);
-            // No temperature changes this fast.
             self.jumps += u64::from(change > 2.0 && gap_s.is_some_and(|gap_s| gap_s <= 2.0));
         }
         self.implausible += u64::from(self.plausible.is_some_and(|(low, high)| !(low..=high).contains(&value)));
@@ -131,7 +125,6 @@ impl Series {
         }
     }
 
-    /// Reads the signal's bits with the alternative layouts.
     fn read_otherwise(&mut self, payload: &[u8], binding: &Binding) {
         self.alternatives.iter_mut().for_each(|other| other.handle(payload, binding.scale, binding.offset));
     }
@@ -151,7 +144,7 @@ impl Series {
     fn note_gap(&mut self, time: Timestamp, max_age_s: f64) -> Option<f64> {
         let gap_s = self.last_time.map(|last| time.since(last).max(0.0));
         if let Some(gap_s) = gap_s {
-            // The sender slept, or the signal was left out.
+            // In a missing stretch, the sender slept or left the signal out.
             let is_missing = gap_s > MISSING_S && gap_s > MISSING_PERIODS * self.period_s().unwrap_or(f64::INFINITY);
             self.gaps.push(gap_s);
             self.loss.push(gap_s);
@@ -184,8 +177,8 @@ impl Series {
         self.gaps.median()
     }
 
-    /// Standard deviation of the white noise, from the changes between readings. The median tolerates a few real steps
-    /// of the value among the changes.
+    /// Standard deviation of the white noise, computed from the median change between readings. A few real steps of
+    /// the value hardly change the median.
     pub(crate) fn noise(&self) -> Option<f64> {
         // The absolute difference of two normal variables with standard deviation s has the median 0.6745 sqrt(2) s.
         Some(self.changes.median()? / (0.6745 * std::f64::consts::SQRT_2))
@@ -206,7 +199,7 @@ impl Series {
         self.extent.range() == 0.0
     }
 
-    /// Number of different values among a hundred kept values, evenly spread.
+    /// Number of different values among about a hundred evenly spread kept values.
     pub fn distinct(&self) -> usize {
         let stride = (self.values.kept().len() / 100).max(1);
         self.values
@@ -230,18 +223,18 @@ impl Series {
         5 * most > 3 * values.len().saturating_sub(1).min(200)
     }
 
-    /// The code that means zero in a signal of `factor` per code: 0, or an offset if the values never come near zero.
-    /// `None` if no usual offset lies among or near the codes.
+    /// The raw code that means zero. This is 0, or a usual offset if the values never come near zero. `None` if no
+    /// usual offset lies among or near the codes. `factor`: value per code.
     pub fn zero_code(&self, factor: f64) -> Option<f64> {
         let (low, high) = (self.extent.min / factor, self.extent.max / factor);
         if low - 3.0 * (high - low) <= 0.0 {
             return Some(0.0);
         }
-        // The middle of a 16-bit and a 12-bit field, then round numbers, the roundest first.
+        // First the middle of a 16-bit or 12-bit field, then round numbers, the roundest first.
         let powers = [32_768.0, 32_767.0, 2048.0, 32_000.0].into_iter();
         let round =
             [10_000.0, 5000.0, 1000.0, 500.0, 100.0].into_iter().map(|step| (0.5 * (low + high) / step).round() * step);
-        // While a pack is only discharged, zero lies beside the codes.
+        // If the pack was only discharged, zero lies outside the codes. Therefore widen the range.
         let (low, high) = (2.0 * low - high, 2.0 * high - low);
         powers.chain(round).find(|zero| *zero > 0.0 && (low..=high).contains(zero))
     }
@@ -252,11 +245,11 @@ impl Series {
     }
 }
 
-/// Thins readings to at most `most`. Fast readings are first thinned to one per `fine_s` (s). Then whole windows of time
-/// are kept, so that the steps from reading to reading stay in the sample however long the log is, and all signals keep
-/// the same times.
+/// Thins readings to at most `most`. First, fast readings are thinned to one per `fine_s` (s). Then whole windows of
+/// time are kept. The sample therefore contains the steps from reading to reading even for a long log, and all
+/// signals keep the same times.
 pub fn windows<T>(mut readings: Vec<(f64, T)>, most: usize, fine_s: f64) -> Vec<(f64, T)> {
-    // Longer than the period of most signals, and short enough that fast signals keep many windows.
+    // This is longer than the period of most signals, and short enough that fast signals keep many windows.
     let window_s = 16.0 * fine_s;
     let span_s = readings.first().zip(readings.last()).map_or(0.0, |((first_s, _), (last_s, _))| last_s - first_s);
     let period_s = span_s / readings.len().max(1) as f64;
@@ -273,9 +266,6 @@ pub fn windows<T>(mut readings: Vec<(f64, T)>, most: usize, fine_s: f64) -> Vec<
 }
 
 /// The value of a recorded payload, within the DBC's range.
-///
-/// # Errors
-/// The reason why the payload has no value.
 pub fn recorded_value(payload: &[u8], binding: &Binding) -> Result<f64, Fault> {
     if is_customary(payload, binding) { Err(Fault::NotAvailable) } else { binding.value(payload) }
 }

@@ -1,16 +1,16 @@
-//! Fits a line through the origin to voltage steps against current steps. The result is the slope of the line, with its
-//! certainty.
+//! Fits a line through the origin to voltage steps against current steps. Returns the slope with its certainty.
 //!
-//! In: steps of a current (A) and of a voltage (V), from blocks of a stream ([`response`](super::response)) or from
-//! the kept readings of two recorded signals. Out: the resistance with its sign, its standard deviation, and the share
-//! of the voltage's variance that the current explains.
+//! In: steps of a current (A) and of a voltage (V). They come from blocks of a stream ([`response`](super::response))
+//! or from the kept readings of two recorded signals. Out: the resistance with its sign, its standard deviation, and
+//! the share of the voltage's variance that the current explains.
 
 use super::series::Series;
 use crate::filter::median;
 
-/// Shortest time of a longer step (s): within a second, the load of a car changes.
+/// Minimum duration of a longer step (s). A car's load changes within a second.
 const LEAST_STEP_S: f64 = 1.0;
-/// Share of the changes that the steps between readings must explain; otherwise, longer steps are used.
+/// If the current explains less than this share of the voltage changes between consecutive readings, longer steps are
+/// used.
 const LEAST_R2: f64 = 0.25;
 
 /// A slope through the origin.
@@ -20,11 +20,9 @@ pub struct Slope {
     pub points: usize,
     /// Resistance: -dV/dI (ohm).
     pub ohm: f64,
-    /// Standard deviation of `ohm`.
     pub(crate) std_ohm: f64,
     /// Share of the voltage's variance that the current explains, 0 to 1.
     pub(crate) r2: f64,
-    /// Largest step of the current (A).
     pub(crate) largest_a: f64,
 }
 
@@ -63,7 +61,7 @@ impl Slope {
         if of_each.is_some_and(|slope| slope.r2 >= LEAST_R2) {
             return of_each;
         }
-        // From one fast reading to the next, a current may change the voltage by less than its resolution.
+        // Between two fast readings, the voltage may change by less than its resolution.
         let mut latest_s = f64::NEG_INFINITY;
         pairs.retain(|pair| {
             let is_later = pair.0 - latest_s >= LEAST_STEP_S;
@@ -108,8 +106,8 @@ impl Slope {
         Some(Self {
             points: points.len(),
             ohm: -xy / xx,
-            // The minimum is necessary because of the limited resolution of the readings: a few steps may lie exactly
-            // on a line by chance.
+            // The minimum is necessary because readings have a limited resolution: a few steps may lie exactly on a
+            // line by chance.
             std_ohm: (rest / xx).sqrt().max(1e-7),
             r2,
             largest_a: largest,

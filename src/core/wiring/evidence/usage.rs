@@ -2,24 +2,23 @@
 //! reports, all at the same times.
 //!
 //! In: readings with their times. Out: at most [`MAX_MOMENTS`] moments, evenly spread over the log. Charge is counted
-//! from one moment to the next (A h, positive = discharge), so thinning loses no charge. A gap begins a new stretch,
-//! because the charge that flowed in the gap is unknown. Assumption: a reading of the current holds until the next.
+//! from one moment to the next (Ah, positive = discharge), so thinning loses no charge. A gap begins a new stretch,
+//! because the charge that flowed in the gap is unknown. Each reading of the current is assumed to hold until the
+//! next reading.
 
 use crate::filter::{ends, median};
 use crate::quantity::Timestamp;
 
-/// Maximum number of moments that are kept.
 const MAX_MOMENTS: usize = 1024;
-/// A current holds for at most this time (s); a longer gap begins a new stretch.
+/// Maximum time for which a current reading holds (s). A longer gap begins a new stretch.
 const MAX_HOLD_S: f64 = 40.0;
-/// Time constant of the smoothed current (s): the slow part of a cell's overvoltage follows a smoothed current.
+/// Time constant of the smoothed current (s). The slow part of a cell's overvoltage follows the smoothed current.
 const SETTLE_S: f64 = 300.0;
-/// Largest difference between a reported state of charge and that of the cells: a vehicle hides a reserve at both ends,
-/// and the controller's estimate has an error.
+/// Maximum difference between the reported state of charge and the cells' state of charge. A vehicle hides a reserve
+/// at both ends, and the controller's estimate has an error.
 pub const HIDDEN_SOC: f64 = 0.13;
-/// A pack's current is never steadily above this (A): such a value has an offset.
+/// Maximum steady current of a pack (A). A larger value contains an offset.
 pub const STEADY_A: f64 = 1000.0;
-/// Number of reported values that are recorded.
 pub(crate) const MAX_REPORTED: usize = 8;
 
 /// State of the pack at one time, in the units of the configuration.
@@ -31,19 +30,16 @@ pub(crate) struct Moment {
     /// Charge counted since the first reading (Ah), positive = discharge.
     pub(crate) charge_ah: f64,
     pub(crate) current_a: f64,
-    /// Current smoothed over [`SETTLE_S`] (A).
     pub(crate) slow_a: f64,
-    /// Voltage of the median cell (V).
     pub(crate) voltage_v: f64,
     /// Latest reported values; NaN = not received yet.
     pub(crate) reported: [f64; MAX_REPORTED],
 }
 
-/// Record of the pack's use.
 #[derive(Debug, Clone)]
 pub(crate) struct UsageRecord {
     moments: Vec<Moment>,
-    /// Least time between two moments (s). Doubles if there are too many moments.
+    /// Minimum time between two moments (s). Doubles if there are too many moments.
     every_s: f64,
     current: Option<(Timestamp, f64)>,
     slow_a: f64,
@@ -54,7 +50,6 @@ pub(crate) struct UsageRecord {
 }
 
 impl UsageRecord {
-    /// Creates an empty record for this number of voltages.
     pub(crate) fn new(cells: usize) -> Self {
         Self {
             moments: Vec::new(),
@@ -75,7 +70,8 @@ impl UsageRecord {
                 self.charge_ah += held_a * passed_s / 3600.0;
                 self.slow_a += (held_a - self.slow_a) * -(-passed_s / SETTLE_S).exp_m1();
             }
-            // Within the jitter of two buses, a stamp may lie before the stamp of the last reading.
+            // Because of jitter between two buses, a reading may be stamped slightly before the previous one. Ignore
+            // it.
             Some((last, _)) if time < last && last.since(time) < 1.0 => return,
             _ => {
                 self.stretch += 1;
@@ -111,25 +107,24 @@ impl UsageRecord {
         }
     }
 
-    /// Ends the stretch: the observer did not listen, or nothing was sent.
+    /// Ends the stretch, because the observer did not listen or no frames were sent.
     pub(crate) fn pause(&mut self) {
         self.current = None;
         self.cells_v.fill(f64::NAN);
         self.reported.fill(f64::NAN);
     }
 
-    /// The moments, in order.
     pub(crate) fn moments(&self) -> &[Moment] {
         &self.moments
     }
 }
 
-/// Charge per reported state of charge, from all stretches.
+/// Charge per reported state of charge, fitted over all stretches.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct ChargeSlope {
     /// Charge (Ah) drawn while the reported state of charge falls from 1 to 0; negative if it rises instead.
     pub(crate) capacity_ah: f64,
-    /// Share of the variance that a common straight line explains, 0 to 1.
+    /// Share of the variance that a common slope of all stretches explains, 0 to 1.
     pub(crate) r2: f64,
     /// Range of the reported value, within one stretch.
     pub(crate) range: f64,
@@ -142,10 +137,11 @@ pub(crate) struct ChargeSlope {
     pub(crate) charge_range_ah: f64,
 }
 
-/// Pairs of charge (Ah) and reported state of charge. Each stretch ends where the controller corrects its value: the
-/// value jumps much further than the charge.
+/// Pairs of charge (Ah) and reported state of charge, for each stretch. A stretch is split where the controller
+/// corrects its value, that is, where the value jumps much further than the charge.
 fn stretches(moments: &[Moment], place: usize) -> Vec<Vec<(f64, f64)>> {
-    /// More jumps than this are the steps of a value that is sent rarely.
+    /// Maximum number of corrections. If there are more jumps, they are the steps of a value that is sent rarely, and
+    /// the stretch is not split.
     const MOST: usize = 3;
     let points = |stretch: &[Moment]| -> Vec<(f64, f64)> {
         let all = stretch.iter().map(|moment| (moment.charge_ah, moment.reported[place]));
@@ -159,7 +155,7 @@ fn stretches(moments: &[Moment], place: usize) -> Vec<Vec<(f64, f64)>> {
         let (charge_ah, soc) = (range(|point| point.0), range(|point| point.1));
         let goes_on = |a: &(f64, f64), b: &(f64, f64)| {
             let change = (b.1 - a.1).abs();
-            // Three steps of a coarse value are not yet a correction.
+            // A change of less than three steps of 1 % is not a correction.
             change < 0.03 || change / soc < 10.0 * (b.0 - a.0).abs() / charge_ah
         };
         let parts: Vec<Vec<(f64, f64)>> = points.chunk_by(goes_on).map(<[_]>::to_vec).collect();

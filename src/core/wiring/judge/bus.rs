@@ -1,5 +1,5 @@
-//! Checks interfaces, identifiers, error frames, other nodes that send with the daemon's identifiers, and end-to-end
-//! protection.
+//! Checks interfaces, identifiers, error frames and end-to-end protection, and finds other nodes that send with the
+//! daemon's identifiers.
 
 use super::context::{Judge, error, find, note, warning};
 use super::text::{count, number, seconds};
@@ -175,7 +175,6 @@ fn on_other_bus(judge: &mut Judge<'_>, message: &MessagePlan) -> Option<()> {
     Some(())
 }
 
-/// Finds other nodes that send frames with an identifier that the daemon uses for its own frames.
 fn conflicts(judge: &mut Judge<'_>) {
     let buses = &judge.observed.buses;
     for output in &judge.plan.outputs {
@@ -241,7 +240,7 @@ fn why_failing<'f>(
         Some((profile, id))
     });
     match found {
-        // An 8-bit checksum cannot identify the 16-bit data identifier: 256 data identifiers fit.
+        // An 8-bit checksum cannot determine the 16-bit data identifier, because 256 data identifiers fit.
         Some((Profile::P01A, id)) => finding
             .why(format!("the checksums fit profile 1A with another data identifier ({id:#X} and 255 others fit)"))
             .change(table, "data_id", "the number in the sender's documentation"),
@@ -255,7 +254,6 @@ fn why_failing<'f>(
     }
 }
 
-/// Lists frame rate and number of identifiers of every interface with frames.
 fn traffic(judge: &mut Judge<'_>) {
     for bus in judge.observed.buses.iter().filter(|bus| bus.frames > 0) {
         let per_s = bus.frames as f64 / judge.observed.seconds().max(1e-3);

@@ -21,7 +21,6 @@ pub(super) const EXPLAINED: f64 = 0.8;
 /// A configured signal with the statistics of its values.
 pub(super) type SignalSeries<'d> = (&'d SignalPlan, &'d Series);
 
-/// State of the judgement.
 pub(super) struct Judge<'d> {
     pub(super) observed: &'d WiringObserver,
     pub(super) plan: &'d Plan,
@@ -32,13 +31,13 @@ pub(super) struct Judge<'d> {
     pub(super) voltage_factor: f64,
     /// Factor that converts the current, read as configured, to A.
     pub(super) current_factor: f64,
-    /// Whether a finding shows that the current or the voltages are not read correctly, for example from the wrong
-    /// signal or with the wrong layout. If so, the response of the voltages cannot be judged.
+    /// Whether a finding shows that the current or the voltages are read from the wrong signal or with the wrong
+    /// layout. If so, the response of the voltages cannot be judged.
     pub(super) is_mixed_up: bool,
-    /// Whether the reported state of charge is known to be another value.
+    /// Whether the signal for the reported state of charge is known to carry another value.
     pub(super) is_soc_wrong: bool,
-    /// Whether a finding shows that the capacity or the scale of the current is wrong. If so, the resistance, which
-    /// scales with the capacity, is not judged.
+    /// Whether a finding shows that the capacity or the scale of the current is wrong. If so, the resistance is not
+    /// judged, because it scales with the capacity.
     pub(super) is_size_explained: bool,
     /// Whether the reported state of charge confirms the configured capacity and the sign of the current.
     pub(super) is_capacity_confirmed: bool,
@@ -49,17 +48,14 @@ pub(super) struct Judge<'d> {
     pub(super) wrong_layouts: Vec<Kind>,
 }
 
-/// Adds an error; the caller adds the texts.
 pub(super) fn error<'j>(judge: &'j mut Judge<'_>, topic: Topic, title: impl Into<String>) -> &'j mut WiringFinding {
     find(judge, Severity::Error, topic, title)
 }
 
-/// Adds a warning; the caller adds the texts.
 pub(super) fn warning<'j>(judge: &'j mut Judge<'_>, topic: Topic, title: impl Into<String>) -> &'j mut WiringFinding {
     find(judge, Severity::Warning, topic, title)
 }
 
-/// Adds a note; the caller adds the texts.
 pub(super) fn note<'j>(judge: &'j mut Judge<'_>, topic: Topic, title: impl Into<String>) -> &'j mut WiringFinding {
     find(judge, Severity::Note, topic, title)
 }
@@ -106,7 +102,6 @@ impl<'d> Judge<'d> {
         self.report.findings.iter().any(|f| f.severity != Severity::Note && topics.contains(&f.topic))
     }
 
-    /// Signals of a kind.
     pub(super) fn signals(&self, kind: Kind) -> Vec<SignalSeries<'d>> {
         let all = self.plan.signals.iter().zip(&self.observed.series);
         all.filter(|(signal, _)| Kind::of(signal.binding.channel) == kind).collect()
@@ -122,7 +117,6 @@ impl<'d> Judge<'d> {
         self.plan.pack.model.as_ref().map_or((1.2, 4.6), |m| (m.voltage_min_v - 0.15, m.voltage_max_v + 0.08))
     }
 
-    /// Capacity of the whole pack (Ah).
     pub(super) fn pack_ah(&self) -> f64 {
         self.plan.pack.capacity_ah * f64::from(self.plan.pack.strings.max(1))
     }
@@ -138,7 +132,6 @@ impl<'d> Judge<'d> {
         self.median_of(Kind::Voltage, |series| series.values.median()).map(|v| v / self.cells_per_reading())
     }
 
-    /// Median of `value` over the signals of a kind.
     pub(super) fn median_of(&self, kind: Kind, value: impl Fn(&Series) -> Option<f64>) -> Option<f64> {
         median(self.signals(kind).into_iter().filter_map(|(_, series)| value(series)))
     }
@@ -150,8 +143,8 @@ impl<'d> Judge<'d> {
         median.filter(|c| (-40.0..80.0).contains(c)).unwrap_or(self.plan.pack.ambient_c)
     }
 
-    /// Range of the model's resistance over the SOC and temperatures of the recording (ohm). The lower end is the
-    /// lowest immediate resistance. The upper end is the highest resistance at the time `block_s` after a current step.
+    /// Range of the model's resistance over the SOC and temperatures of the recording (ohm). The range extends from
+    /// the lowest immediate resistance to the highest resistance at the time `block_s` after a current step.
     pub(super) fn model_ohm(&self, model: &CellModel, block_s: f64) -> (f64, f64) {
         let spread = |kind, per: f64, middle: f64| {
             let at = |q| self.median_of(kind, |series| series.values.quantile(q)).map_or(middle, |value| value * per);

@@ -13,8 +13,8 @@ pub(super) struct Drift {
     pub(super) seconds: f64,
     /// Sum of the absolute drifts that the model expects (V).
     pub(super) expected_v: f64,
-    /// Mean measured drift of a run, weighted by the expected drift: absolute value (V). It is reported if the measured
-    /// drift is opposite to the expected drift.
+    /// Mean measured drift of a run, weighted by the expected drift (V, absolute value). The finding of an inverted
+    /// current shows this value.
     pub(super) against_v: f64,
     /// Ratio of measured to expected drift, weighted by the expected drift.
     pub(super) ratio: f64,

@@ -1,5 +1,5 @@
-//! Checks the sign and unit of the current, and the resistance of the cells. To do so, compares the measured response
-//! of the voltages to the current with the response of the cell model.
+//! Checks the sign and unit of the current, and the resistance of the cells. The checks compare the measured response
+//! of the voltages to the current with the cell model.
 
 use super::context::{EXPLAINED, Judge, error, find, warning};
 use super::drift::Drift;
@@ -133,7 +133,8 @@ fn resistance(judge: &mut Judge<'_>, slope: &Slope) {
     } else if ohm < fast && pack.label.is_some() && judge.is_capacity_confirmed {
         judge.fine(format!("the cells are made for high power, and the reported SOC confirms their capacity: {seen}"));
     } else if ratio >= ODD_RATIO || ratio >= 2.0 && strings.is_some_and(|n| n < configured) {
-        // The resistance of a label's model is proportional to 1 / capacity.
+        // If the model is derived from a label (chemistry and capacity), its resistance is proportional to 1 /
+        // capacity.
         let (key, text) = pack.capacity_change(pack.capacity_ah * (fast * slow).sqrt() / ohm);
         let is_label = pack.label.is_some();
         let title = format!("the resistance is {} times {direction} than in the cell model", number(ratio));
@@ -152,7 +153,7 @@ fn resistance(judge: &mut Judge<'_>, slope: &Slope) {
 /// A different number of parallel strings that would explain the resistance.
 fn likely_strings(configured: u16, ohm: f64, (fast, slow): (f64, f64)) -> Option<u16> {
     let by_string = ohm / f64::from(configured);
-    // If the number exceeds `u16`, the cast saturates. The caller does not use such a number, because the ratio of the
+    // If the number exceeds `u16`, the cast saturates. The caller ignores such a number, because the ratio of the
     // resistances is then too large.
     let strings = (((fast * slow).sqrt() / by_string).round() as u16).max(1);
     // A cell's resistance usually differs from its model's resistance by a factor of less than 1.3.

@@ -1,5 +1,5 @@
-//! Finds signals that never change while other signals change, cells that respond differently, and cells with the same
-//! voltage.
+//! Finds signals that never change while other signals change, cells whose voltage responds differently to the
+//! current, and cells with the same voltage.
 
 use super::context::{EXPLAINED, Judge, SignalSeries, error, warning};
 use super::holes::span;
@@ -12,7 +12,7 @@ use crate::wiring::evidence::{HIDDEN_SOC, Series, Slope};
 use crate::wiring::plan::{Kind, SignalPlan};
 use crate::wiring::report::Topic;
 
-/// Fewest readings of a signal that is judged.
+/// Minimum number of readings for judging a signal.
 const FEWEST_READINGS: u64 = 20;
 
 pub(super) fn check(judge: &mut Judge<'_>) {
@@ -97,8 +97,9 @@ pub(super) fn check_stopped(judge: &mut Judge<'_>) {
         .advice("the sensor or its sender fails in this time; estimates do not know the charge that flows");
 }
 
-/// How voltages or the reported state of charge (at `place`) show that a current flows, if they do. A resting voltage
-/// relaxes in one direction, and a controller corrects its state of charge by a jump, or by less than its largest error.
+/// Describes how the voltages or the reported state of charge (at `place`) show that a current flows; `None` if they
+/// do not. Two changes do not count. A resting voltage relaxes in one direction. A controller corrects its state of
+/// charge by a jump, or by less than its largest error.
 fn movement(run: &[Moment], place: Option<usize>, least_v: f64) -> Option<String> {
     let steps = |sign: f64| run.windows(2).filter(|p| sign * (p[1].voltage_v - p[0].voltage_v) > least_v).count();
     let socs: Vec<f64> = place.map_or_else(Vec::new, |at| run.iter().map(|moment| moment.reported[at]).collect());
@@ -112,7 +113,7 @@ fn movement(run: &[Moment], place: Option<usize>, least_v: f64) -> Option<String
     (up.min(down) >= 3).then(|| format!("the voltage of a cell makes {} steps above {} mV", up + down, milli(least_v)))
 }
 
-/// Finds cells whose signals show the voltage of another cell, from their bits and from their values.
+/// Finds cells whose signals show the voltage of another cell, by comparing bits and values of the signals.
 pub(super) fn check_equal(judge: &mut Judge<'_>) {
     let voltages = judge.signals(Kind::Voltage);
     let mut reported: Vec<Channel> = Vec::new();
@@ -150,7 +151,6 @@ pub(super) fn check_equal(judge: &mut Judge<'_>) {
     }
 }
 
-/// Finds cells whose voltage does not follow the current as the voltages of the other cells do.
 pub(super) fn check_response(judge: &mut Judge<'_>) {
     let is_clear = |slope: &Slope| slope.ohm > 0.0 && slope.certainty() >= 1.0 && slope.r2 >= EXPLAINED;
     let Some(common) = judge.observed.slope().filter(is_clear) else { return };

@@ -1,4 +1,5 @@
-//! Names missing stretches: holes of the whole log, and stretches in which one input is missing while others arrive.
+//! Finds missing stretches: times without any frame (holes of the log), and times in which one input is missing while
+//! other frames arrive.
 
 use super::context::{Judge, find};
 use super::text::{channel, count, number, percent, seconds};
@@ -9,7 +10,7 @@ use crate::wiring::observer::Hole;
 use crate::wiring::plan::{Kind, SignalPlan};
 use crate::wiring::report::{Severity, Topic};
 
-/// A log with more holes than this consists of many trips: its holes are pauses.
+/// If a log has more holes than this, it consists of many trips and its holes are pauses.
 const FEW: usize = 3;
 
 pub(super) fn check(judge: &mut Judge<'_>) {
@@ -17,7 +18,8 @@ pub(super) fn check(judge: &mut Judge<'_>) {
     of_inputs(judge);
 }
 
-/// Reports the holes of the log. Only a hole in which the pack was in use is a warning: a parked car's buses sleep.
+/// Reports the longest hole of the log. The finding is a warning only if the pack was in use, because the buses of a
+/// parked car sleep.
 fn of_log(judge: &mut Judge<'_>) {
     let observed = judge.observed;
     let longest = observed.holes.iter().max_by(|a, b| a.seconds().total_cmp(&b.seconds()));
@@ -36,24 +38,23 @@ fn of_log(judge: &mut Judge<'_>) {
     find(judge, severity, Topic::Missing, title).seen(format!("no frames {span}; {holes} of more than 30 s")).why(why);
 }
 
-/// The longest hole in which the pack was in use, and how the readings around the hole show this.
 fn used_hole<'d>(judge: &Judge<'d>) -> Option<(&'d Hole, String)> {
     let use_of = |hole: &'d Hole| Some((hole, use_in(judge, hole)?));
     let used = judge.observed.holes.iter().filter_map(use_of);
     used.max_by(|a, b| a.0.seconds().total_cmp(&b.0.seconds()))
 }
 
-/// How the readings around a hole show that the pack was in use.
+/// Describes the readings around a hole that show that the pack was in use; `None` if no reading shows this.
 fn use_in(judge: &Judge<'_>, hole: &Hole) -> Option<String> {
     let moments = judge.observed.usage.moments();
     let before = moments.iter().rfind(|moment| moment.time <= hole.from)?;
     use_between(judge, before, &moments[moments.partition_point(|moment| moment.time < hole.to)..])
 }
 
-/// How the readings around a missing stretch show that the pack was in use. A parked pack feeds small loads, and its
-/// controller corrects the state of charge by some per cent.
+/// As [`use_in`], with the last moment before and the moments after a missing stretch. Small changes do not count,
+/// because a parked pack feeds small loads and its controller corrects the state of charge by some per cent.
 fn use_between(judge: &Judge<'_>, before: &Moment, after: &[Moment]) -> Option<String> {
-    /// Smallest mean current that shows use, in multiples of the capacity per hour.
+    /// Minimum mean current that shows use, in multiples of the capacity per hour.
     const LEAST_RATE: f64 = 0.1;
     let hours = after.first()?.time.since(before.time) / 3600.0;
     let socs = judge.observed.witnesses.iter().enumerate();
@@ -75,8 +76,8 @@ fn use_between(judge: &Judge<'_>, before: &Moment, after: &[Moment]) -> Option<S
     }
 }
 
-/// Reports for each kind of input the longest stretch in which it is missing while other frames arrive. Kinds that are
-/// missing at the same time are one finding: their sender slept.
+/// Reports for each kind of input the longest stretch in which it is missing while other frames arrive. If several
+/// kinds are missing at the same time, they are one finding, because their sender slept.
 fn of_inputs(judge: &mut Judge<'_>) {
     let mut found: Vec<MissingInput<'_>> = Vec::new();
     for kind in [Kind::Current, Kind::Voltage, Kind::Temperature, Kind::Reported] {
@@ -96,7 +97,7 @@ fn of_inputs(judge: &mut Judge<'_>) {
     found.into_iter().for_each(|missing| report(judge, missing));
 }
 
-/// A stretch in which inputs are missing. The signal and its period are those of the first input.
+/// A stretch in which inputs are missing. `signal` and `period_s` belong to the first of these inputs.
 struct MissingInput<'d> {
     names: Vec<String>,
     kinds: Vec<Kind>,
@@ -127,7 +128,7 @@ fn missing_input<'d>(judge: &Judge<'d>, kind: Kind) -> Option<MissingInput<'d>> 
 
 fn report(judge: &mut Judge<'_>, MissingInput { names, kinds, signal, period_s, hole }: MissingInput<'_>) {
     let Some(first) = judge.observed.first else { return };
-    // If current and voltages are missing together, the pack sleeps.
+    // If current and voltages are missing together and the pack was not in use, the pack slept.
     let is_all = kinds.contains(&Kind::Current) && kinds.contains(&Kind::Voltage);
     let is_asleep = is_all && use_in(judge, &hole).is_none();
     let is_minor = is_asleep || Kind::of(signal.binding.channel) == Kind::Reported;
@@ -143,7 +144,6 @@ fn report(judge: &mut Judge<'_>, MissingInput { names, kinds, signal, period_s, 
         .why(why);
 }
 
-/// Describes a stretch by its times after the first frame.
 pub(super) fn span(first: Timestamp, from: Timestamp, length_s: f64) -> String {
     let start_s = from.since(first);
     format!("from {} to {} after the first frame", seconds(start_s), seconds(start_s + length_s))

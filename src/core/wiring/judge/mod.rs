@@ -4,7 +4,7 @@
 //! | file | checks |
 //! | --- | --- |
 //! | `bus` | interfaces, identifiers, error frames, other nodes that send with the daemon's identifiers, end-to-end protection |
-//! | `other_bus` | the current's message on two interfaces |
+//! | `other_bus` | the message with the pack current on two interfaces |
 //! | `unconfigured` | pack voltage and states of charge that are not configured |
 //! | `presence` | silent signals, number of cells |
 //! | `swapped` | swapped signals |

@@ -21,12 +21,11 @@ pub(super) fn check(judge: &mut Judge<'_>, drift: Option<Drift>) {
     noise(judge);
 }
 
-/// Compares the resting voltage and the voltage drift with the model's curve.
 fn open_circuit(judge: &mut Judge<'_>, model: &CellModel, drift: Option<Drift>) {
     let temperature_c = judge.temperature_c();
     let [empty_v, full_v] = [0.0, 1.0].map(|soc| ocv_v(model, soc, temperature_c));
     let mut rests = judge.observed.fast_response().rests.iter().map(|rest| rest.end_v);
-    // In a log without rests, the voltage under load, corrected for the current, shows the curve.
+    // Without rests, use the voltage under load, corrected for the current.
     let loaded = ocv::estimates(judge);
     let loaded_v = median(loaded.iter().map(|estimate| estimate.voltage_v)).filter(|_| loaded.len() >= 5);
     let (lowest, highest) = match ends(rests.clone()) {
@@ -34,7 +33,7 @@ fn open_circuit(judge: &mut Judge<'_>, model: &CellModel, drift: Option<Drift>) 
         _ => (loaded_v.unwrap_or(f64::NAN), loaded_v.unwrap_or(f64::NAN)),
     };
     let per_cent = |voltage_v: f64| percent(model.soc_of_ocv(voltage_v, temperature_c).clamp(0.0, 1.0));
-    // A flat curve does not show the state of charge, so it gives no expectation.
+    // A flat curve does not show the state of charge, so it cannot predict a drift.
     let is_model_flat = ocv_v(model, 0.8, temperature_c) - ocv_v(model, 0.3, temperature_c) < FLAT_V;
     let is_flat = |drift: &Drift| {
         !is_model_flat && drift.expected_v > 0.03 && drift.sigma > 0.0 && (-0.05..0.15).contains(&drift.ratio)
@@ -78,8 +77,9 @@ fn open_circuit(judge: &mut Judge<'_>, model: &CellModel, drift: Option<Drift>) 
     }
 }
 
-/// Whether the voltage is above the curve only while the charger holds it there: the pack is not discharged at these
-/// voltages, and reports that it is full or, without such a report, was charged from the curve.
+/// Whether the voltage is above the model's curve only because a charger holds it there. True if the pack is hardly
+/// discharged at these voltages and reports that it is full. If it reports no state of charge, the first voltage must
+/// not be above the curve.
 fn is_held_full(judge: &Judge<'_>, estimates: &[OcvEstimate], full_v: f64) -> bool {
     let is_above = |estimate: &&OcvEstimate| estimate.voltage_v - estimate.slack_v > full_v;
     let above: Vec<&OcvEstimate> = estimates.iter().filter(is_above).collect();
@@ -90,7 +90,8 @@ fn is_held_full(judge: &Judge<'_>, estimates: &[OcvEstimate], full_v: f64) -> bo
     10 * discharged <= above.len() && soc.map_or(is_charged, |soc| soc >= 0.9)
 }
 
-/// Largest rise of the voltage from 30 to 80 % of a flat curve (V): LFP has 0.06 V, other chemistries 0.3 V or more.
+/// If the voltage rises by less than this from 30 to 80 % (V), the curve is flat. LFP rises by 0.06 V, other
+/// chemistries by at least 0.3 V.
 const FLAT_V: f64 = 0.15;
 
 fn ocv_v(model: &CellModel, soc: f64, temperature_c: f64) -> f64 {
@@ -104,7 +105,7 @@ fn is_like_iron_phosphate(judge: &Judge<'_>, model: &CellModel, cell_v: f64) -> 
     ocv_v(model, 0.5, judge.temperature_c()) > 3.5 && LFP_V.contains(&cell_v)
 }
 
-/// The key of the chemistry, and the chemistry that a resting voltage suggests.
+/// Configuration key and proposed value for the chemistry that a resting voltage suggests.
 fn chemistry(judge: &Judge<'_>, voltage_v: f64) -> (&'static str, String) {
     let pack = &judge.plan.pack;
     match voltage_v {

@@ -1,26 +1,23 @@
-//! Estimates the open-circuit voltage of the median cell during use: the voltage, corrected for the current.
+//! Estimates the open-circuit voltage of the median cell during use, by correcting the voltage for the current.
 //!
-//! The correction is only as good as the resistance: the measured one if the steps of the current show it, otherwise
-//! the cell model's. Every estimate has a slack that covers half of the correction, the spread of curves between cells
-//! of one chemistry, and hysteresis.
+//! The correction uses the measured resistance if the current steps show it, otherwise the resistance of the cell
+//! model. Each estimate has a slack. It covers half of the correction, the spread of the curves of one chemistry, and
+//! hysteresis.
 
 use super::context::{EXPLAINED, Judge};
 use crate::wiring::evidence::usage::MAX_REPORTED;
 
-/// Slack of a voltage without current (V): the curves of cells with the same label differ by up to 30 mV, and the
-/// hysteresis of iron phosphate is 10 mV.
+/// Slack of a voltage without current (V). The curves of cells with the same label (chemistry and capacity) differ by
+/// up to 30 mV. The hysteresis of iron phosphate is 10 mV.
 const SLACK_V: f64 = 0.04;
 
-/// An estimate of the open-circuit voltage.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct OcvEstimate {
-    /// Estimate (V).
     pub(super) voltage_v: f64,
     /// Largest error of the estimate (V).
     pub(super) slack_v: f64,
     /// Current (A), positive = discharge.
     pub(super) current_a: f64,
-    /// Values that the pack reports at this time.
     pub(super) reported: [f64; MAX_REPORTED],
     pub(super) stretch: u32,
 }
@@ -48,10 +45,9 @@ pub(super) fn estimates(judge: &Judge<'_>) -> Vec<OcvEstimate> {
     judge.observed.usage.moments().iter().map(estimate).collect()
 }
 
-/// Whether the state of charge that the voltages show changes against a current of one sign: whether it rises
-/// (`is_rise`) or falls by more than the errors of the estimates explain.
+/// Whether the state of charge that the voltages show rises (`is_rise`) or falls (not `is_rise`) by more than the
+/// errors of the estimates explain. The caller calls this function if the current has only the opposite sign.
 pub(super) fn moves_against(judge: &Judge<'_>, is_rise: bool) -> bool {
-    /// Smallest change of the state of charge that counts.
     const LEAST: f64 = 0.05;
     let Some(model) = &judge.plan.pack.model else { return false };
     let temperature_c = judge.temperature_c();
@@ -59,7 +55,7 @@ pub(super) fn moves_against(judge: &Judge<'_>, is_rise: bool) -> bool {
     let estimates = estimates(judge);
     let mut moved = 0;
     for stretch in estimates.chunk_by(|a, b| a.stretch == b.stretch) {
-        // The bound of the moments so far from which a change counts.
+        // Lowest upper bound of the state of charge so far. To find a fall, the signs are inverted.
         let mut bound: Option<f64> = None;
         for estimate in stretch {
             let (low, high) = (soc(estimate.voltage_v - estimate.slack_v), soc(estimate.voltage_v + estimate.slack_v));

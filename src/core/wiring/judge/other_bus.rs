@@ -1,4 +1,5 @@
-//! If the current's message appears on two interfaces, decides which of the two currents the voltages follow.
+//! If the message with the pack current appears on two interfaces, decides which of the two currents the voltages
+//! follow.
 
 use super::context::{EXPLAINED, Judge, error, warning};
 use super::text::number;
@@ -17,7 +18,7 @@ pub(super) fn check(judge: &mut Judge<'_>) {
         match (here.is_some_and(|slope| is_clear(&slope)), there) {
             (false, Some(there)) => followed(judge, signal, (*bus, &there), here),
             _ if is_alike(series, &other.series) => {}
-            // Two packs on two buses: the voltages seem to follow both currents.
+            // If two packs are on two buses, the voltages may follow both currents.
             (true, Some(_)) if has_voltages(judge, *bus) => two_buses(judge, signal, (*bus, other)),
             (true, _) => {}
             (false, None) if has_voltages(judge, *bus) => two_buses(judge, signal, (*bus, other)),
@@ -26,12 +27,10 @@ pub(super) fn check(judge: &mut Judge<'_>) {
     }
 }
 
-/// Whether voltages are read from this interface.
 fn has_voltages(judge: &Judge<'_>, bus: BusIndex) -> bool {
     judge.signals(Kind::Voltage).iter().any(|(signal, _)| signal.binding.bus == bus)
 }
 
-/// Whether the voltages clearly follow a current.
 fn is_clear(slope: &Slope) -> bool {
     slope.certainty() >= 1.0 && slope.r2 >= EXPLAINED
 }
@@ -59,7 +58,7 @@ fn followed(judge: &mut Judge<'_>, signal: &SignalPlan, (bus, there): (BusIndex,
 }
 
 /// Reports that the current is read from one interface and the voltages from another, while both interfaces carry the
-/// current's message.
+/// message with the pack current.
 fn two_buses(judge: &mut Judge<'_>, signal: &SignalPlan, (bus, other): (BusIndex, &OtherCurrent)) {
     let (configured, name) = (judge.interface(signal.binding.bus), judge.interface(bus));
     let (low, high) = (number(other.series.extent.min), number(other.series.extent.max));

@@ -11,7 +11,6 @@ use crate::wiring::evidence::Series;
 use crate::wiring::plan::{Kind, SignalPlan};
 use crate::wiring::report::{Severity, Topic};
 
-/// Reason why a signal has no value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum Absence {
     Message,
@@ -25,7 +24,6 @@ enum Absence {
     Zero,
 }
 
-/// A signal without values.
 type Absent<'d> = (&'d SignalPlan, Absence);
 
 pub(super) fn check(judge: &mut Judge<'_>) {
@@ -47,7 +45,7 @@ fn absence(judge: &Judge<'_>, signal: &SignalPlan, series: &Series) -> Option<Ab
         let is_magnitude = signal.binding.channel == Channel::Current && judge.plan.has_direction();
         let is_on_bus = judge.bus(signal.binding.bus).is_some_and(|bus| bus.ids.contains_key(&signal.binding.id));
         return Some(match series.unusable {
-            // Without its direction, a magnitude is not read.
+            // A current that is sent as a magnitude is not read while its direction is missing.
             _ if series.frames == 0 && is_magnitude && is_on_bus => Absence::Direction,
             _ if series.frames == 0 => Absence::Message,
             unusable if unusable.not_available > 0 => Absence::NotAvailable,
@@ -62,7 +60,7 @@ fn absence(judge: &Judge<'_>, signal: &SignalPlan, series: &Series) -> Option<Ab
     // If a pack has fewer cells than its DBC describes, the signals of the missing cells are often zero.
     let is_cell = matches!(signal.binding.channel, Channel::CellVoltage(_));
     let is_unused = is_cell && judge.plan.pack.cells > 1 && last.abs() < 0.05 * median_v;
-    // The pack is switched off, or the identifier belongs to another message.
+    // Either the pack is switched off, or the identifier belongs to another message.
     let is_dead = Kind::of(signal.binding.channel) == Kind::Voltage && median_v == 0.0 && last == 0.0;
     (is_still && (is_unused || is_dead)).then_some(Absence::Zero)
 }
@@ -71,9 +69,9 @@ fn cell_number(signal: &SignalPlan) -> Option<u16> {
     if let Channel::CellVoltage(cell) = signal.binding.channel { Some(cell.0) } else { None }
 }
 
-/// If exactly the last cells are absent, reports that too many cells are configured. Returns the signals that are still
-/// to be reported. If the message was not received or its values are "not available", the last module may be dead. In
-/// this case, the signals of the absent cells stay in the list.
+/// If exactly the last cells are absent, reports that too many cells are configured. Returns the signals that are
+/// still to be reported. They include the absent cells if the last module may be dead: the message was not received,
+/// or its values are "not available".
 fn fewer_cells<'d>(judge: &mut Judge<'d>, absent: Vec<Absent<'d>>) -> Vec<Absent<'d>> {
     let mut cells: Vec<u16> = absent.iter().filter_map(|(signal, _)| cell_number(signal)).collect();
     cells.sort_unstable();
@@ -154,7 +152,6 @@ fn evidence(judge: &Judge<'_>, absence: Absence, signals: &[&SignalPlan], what: 
     }
 }
 
-/// Probable cause and advice.
 fn cause(judge: &Judge<'_>, bus: BusIndex, id: CanId, absence: Absence) -> (&'static str, &'static str) {
     match absence {
         Absence::Message => (
@@ -189,7 +186,8 @@ fn cause(judge: &Judge<'_>, bus: BusIndex, id: CanId, absence: Absence) -> (&'st
     }
 }
 
-/// Finds signals of `plan.more_cells` that carry cell voltages: the pack has more cells than configured.
+/// Finds signals of `plan.more_cells` that carry cell voltages. If there are any, the pack has more cells than
+/// configured.
 fn more_cells(judge: &mut Judge<'_>) {
     let Some(median_v) = judge.cell_voltage() else { return };
     let plan = judge.plan;
@@ -210,7 +208,6 @@ fn more_cells(judge: &mut Judge<'_>) {
         .change("pack", "cells", cells.to_string());
 }
 
-/// Lists the signals that are present.
 fn present(judge: &mut Judge<'_>) {
     for kind in [Kind::Current, Kind::Voltage, Kind::Temperature, Kind::Reported] {
         let all = judge.signals(kind);

@@ -1,6 +1,5 @@
 //! Compares the values that the pack itself reports (state of charge and health) with the counted charge and with the
-//! voltages. The pack's own values are witnesses: a wrong number of cells, a wrong chemistry, a wrong capacity or a
-//! wrong current contradicts them.
+//! voltages. A wrong number of cells, chemistry, capacity or current contradicts these values.
 
 use super::context::{EXPLAINED, Judge, error, find};
 use super::electrical;
@@ -14,10 +13,10 @@ use crate::wiring::evidence::usage::{ChargeSlope, Moment};
 use crate::wiring::plan::{SignalPlan, two_digits};
 use crate::wiring::report::{Severity, Topic};
 
-/// Smallest change of a reported state of charge that is compared with the counted charge.
+/// Minimum change of a reported state of charge that is compared with the counted charge.
 const LEAST_RANGE: f64 = 0.05;
-/// A reported value contradicts the voltage if more than this share of the moments disagree. It agrees if at most the
-/// rest disagree.
+/// If more than this share of the moments disagree, a reported value contradicts the voltage. If at most one minus
+/// this share of the moments disagree, it agrees.
 const MOST: f64 = 0.75;
 
 /// Usual ratios of the counted to the configured capacity.
@@ -26,7 +25,6 @@ const USUAL: std::ops::RangeInclusive<f64> = 0.55..=1.3;
 /// A reported state of charge: its signal, and its place in the record of the pack's use.
 type Reported<'d> = (&'d SignalPlan, usize);
 
-/// Checks the current and the capacity.
 pub(super) fn check_charge(judge: &mut Judge<'_>) {
     if judge.is_mixed_up || judge.has(&[Topic::Unit, Topic::Layout, Topic::Swapped]) {
         return;
@@ -81,7 +79,7 @@ pub(super) fn check_charge(judge: &mut Judge<'_>) {
     }
 }
 
-/// Reports a counted charge that no pack of the configured capacity holds.
+/// Reports a counted charge that exceeds what a pack of the configured capacity can hold.
 fn too_much(judge: &mut Judge<'_>, current: &SignalPlan) {
     let moments = judge.observed.usage.moments();
     let counted = |stretch: &[Moment]| {
@@ -90,7 +88,7 @@ fn too_much(judge: &mut Judge<'_>, current: &SignalPlan) {
     };
     let largest_ah = moments.chunk_by(|a, b| a.stretch == b.stretch).map(counted).fold(0.0, f64::max);
     let pack_ah = judge.pack_ah();
-    // From full to empty is once the capacity; the offset of a sensor adds to it in a long log.
+    // A full discharge counts once the capacity. In a long log, the offset of a sensor adds to this.
     if largest_ah <= 2.0 * pack_ah {
         return;
     }
@@ -128,13 +126,13 @@ fn one_sided(judge: &mut Judge<'_>, current: &SignalPlan, side: &str, movement: 
         .advice("the sign is elsewhere in the message: a sign bit, a direction byte or a second signal");
 }
 
-/// Reports a counted charge that does not fit the capacity.
+/// Reports that the counted charge does not fit the configured capacity.
 fn size(judge: &mut Judge<'_>, (signal, current): (&SignalPlan, &SignalPlan), slope: ChargeSlope, ratio: f64) {
     let strings = f64::from(judge.plan.pack.strings.max(1));
     let [measured, configured] = [slope.capacity_ah, judge.pack_ah()].map(number);
     judge.is_size_explained = true;
     let (cell_ah, scale) = (slope.capacity_ah / strings, current.scale / ratio);
-    // The capacity of a used pack differs from the label, so a scale near 1 is probably 1.
+    // The capacity of a used pack differs from its label, so a scale near 1 is probably 1.
     let scale = if (0.8..=1.25).contains(&scale) { 1.0 } else { two_digits(scale) };
     let seen = format!(
         "{} falls from 100 to 0 % over {measured} Ah counted from {}; {configured} Ah are configured",
@@ -166,13 +164,13 @@ fn size(judge: &mut Judge<'_>, (signal, current): (&SignalPlan, &SignalPlan), sl
 pub(super) fn reported<'d>(judge: &Judge<'d>, channel: Channel) -> Vec<Reported<'d>> {
     let witnesses = judge.observed.witnesses.iter().enumerate();
     let of_channel = witnesses.map(|(place, witness)| (judge.plan.witness(*witness), place));
-    // A value that is always zero is not sent by this pack.
+    // If a value is always zero, this pack does not send it.
     let is_sent = |value: f64| value.is_finite() && value != 0.0;
     let is_heard = |place: usize| judge.observed.usage.moments().iter().any(|m| is_sent(m.reported[place]));
     of_channel.filter(|(signal, place)| signal.binding.channel == channel && is_heard(*place)).collect()
 }
 
-/// Finds exchanged states of charge and health: by their names, or because only the reported health follows the
+/// Finds exchanged states of charge and health, either by their names or because only the reported health follows the
 /// charge.
 pub(super) fn check_swapped(judge: &mut Judge<'_>) {
     let configured =
@@ -217,8 +215,8 @@ pub(super) fn check_swapped(judge: &mut Judge<'_>) {
     }
 }
 
-/// Compares the reported state of charge with the voltage. If a wrong number of cells or a wrong chemistry explains a
-/// contradiction, reports it.
+/// Compares the reported state of charge with the voltage. Reports a contradiction that a wrong number of cells or a
+/// wrong chemistry explains.
 pub(super) fn check_voltage(judge: &mut Judge<'_>) {
     let is_unclear = judge.is_mixed_up || judge.has(&[Topic::Layout, Topic::CellCount, Topic::CurrentSign]);
     let Some(model) = judge.plan.pack.model.as_ref().filter(|_| !is_unclear && !judge.is_soc_wrong) else { return };
@@ -269,7 +267,7 @@ fn contradiction(judge: &mut Judge<'_>, seen: String, counts: Option<(u16, u16)>
                 chemistry.name()
             ),
         ),
-        // A controller that loses count also reports a wrong state of charge.
+        // The controller may have lost count, so its state of charge may be wrong.
         (None, None) => return judge.unjudged(format!("reported SOC: it contradicts the voltage; {seen}")),
     };
     judge.is_model_wrong = true;
@@ -303,7 +301,6 @@ fn outside(judge: &Judge<'_>, points: &[(OcvEstimate, f64)], model: &CellModel, 
     points.iter().filter(is_outside).count() as f64 / points.len().max(1) as f64
 }
 
-/// Smallest and largest number of cells with which a pack voltage agrees with the reported state of charge.
 fn cell_counts(judge: &Judge<'_>, points: &[(OcvEstimate, f64)], model: &CellModel) -> Option<(u16, u16)> {
     let configured = judge.plan.pack.cells;
     if !judge.plan.pack.is_total {

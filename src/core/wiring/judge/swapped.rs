@@ -18,7 +18,6 @@ pub(super) fn check(judge: &mut Judge<'_>) {
     }
 }
 
-/// Finds signals whose values differ too much from the median of all signals of the same kind.
 pub(super) fn check_odd(judge: &mut Judge<'_>) {
     odd_cells(judge);
     odd_sensors(judge);
@@ -129,8 +128,8 @@ fn fit(judge: &Judge<'_>, series: &Series) -> Option<Fit> {
     })
 }
 
-/// If the pack has a single voltage signal, finds exchanged signals among current, voltage and temperature: the values
-/// of each signal are plausible only for the other quantity.
+/// Finds exchanged signals among current, voltage and temperature, if the pack has a single voltage signal. Two
+/// signals are exchanged if the values of each are plausible only for the other quantity.
 fn by_values(judge: &mut Judge<'_>) {
     let voltages = judge.signals(Kind::Voltage);
     let (Some(current), [voltage]) = (judge.current(), voltages.as_slice()) else { return };
@@ -165,7 +164,6 @@ fn is_current_like(temperature: &Series, current: &Series) -> bool {
     temperature.jumps >= 3 && current.jumps == 0 && (5.0..=60.0).contains(&level)
 }
 
-/// Finds cells whose voltage differs too much from the voltage of the median cell.
 fn odd_cells(judge: &mut Judge<'_>) {
     let voltages = judge.signals(Kind::Voltage);
     let Some(median_v) = judge.cell_voltage().filter(|_| voltages.len() >= 4) else { return };
@@ -187,7 +185,6 @@ fn odd_cells(judge: &mut Judge<'_>) {
     }
 }
 
-/// Finds temperature sensors whose value differs too much from the median of the sensors.
 fn odd_sensors(judge: &mut Judge<'_>) {
     let sensors = judge.signals(Kind::Temperature);
     // `values` reports the sensors with impossible values.

@@ -1,4 +1,4 @@
-//! Compares the periods of signals with the age from which readings are stale, and with the DBC's cycle times.
+//! Compares the periods of signals with the age at which readings become stale, and with the DBC's cycle times.
 
 use super::context::{Judge, SignalSeries, find, warning};
 use super::text::{count, percent, seconds, toml};
@@ -20,7 +20,7 @@ pub(super) fn check(judge: &mut Judge<'_>) {
     cycle_times(judge);
 }
 
-/// Finds messages that lose frames: the gaps between readings are multiples of the message's cycle.
+/// Finds messages that lose frames. The gaps between their readings are multiples of the message's cycle.
 fn lost(judge: &mut Judge<'_>) {
     for message in &judge.plan.messages {
         let signals = judge.plan.signals.iter().zip(&judge.observed.series);
@@ -91,7 +91,7 @@ fn cycle_times(judge: &mut Judge<'_>) {
         let Some(cycle_s) = message.cycle_time_s.filter(|_| message.pages <= 1) else { continue };
         let (span_s, awake_s) = (stats.last.since(stats.first), judge.observed.awake_s);
         let span_s = if awake_s + 1.0 < span_s { awake_s } else { span_s };
-        // The sender may sleep while the bus is awake.
+        // Leave out the time in which the sender slept while the bus was awake.
         let signals = judge.plan.signals.iter().zip(&judge.observed.series);
         let of_message = signals.filter(|(s, _)| (s.binding.bus, s.binding.id) == (message.bus, message.id));
         let span_s = span_s - of_message.map(|(_, series)| series.missing_s).fold(0.0, f64::max);

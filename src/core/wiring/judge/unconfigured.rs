@@ -1,5 +1,5 @@
-//! Compares signals that are not configured with configured signals: the pack's voltage with the sum of the cell
-//! voltages, and a second state of charge with the configured state of charge.
+//! Compares signals that are not configured with configured signals. The pack's voltage is compared with the sum of
+//! the cell voltages. A second state of charge is compared with the configured one.
 
 use super::context::{Judge, SignalSeries, find, warning};
 use super::text::number;
@@ -8,9 +8,9 @@ use crate::wiring::evidence::HIDDEN_SOC;
 use crate::wiring::plan::Kind;
 use crate::wiring::report::{Severity, Topic};
 
-/// Sensor errors explain a deviation of the sum of the cell voltages from the pack's voltage up to this fraction.
+/// Maximum deviation of the sum of the cell voltages from the pack's voltage that sensor errors explain, fraction.
 const SUM_TOLERANCE: f64 = 0.03;
-/// Largest difference between two states of charge that agree.
+/// Maximum difference between two states of charge that agree.
 const AGREEMENT: f64 = 0.03;
 
 pub(super) fn check(judge: &mut Judge<'_>) {
@@ -82,7 +82,7 @@ fn states_of_charge(judge: &mut Judge<'_>) {
             judge.fine(format!("{} and {} agree: {own_percent} and {percent} %", own.name, signal.name));
             continue;
         }
-        // A smaller difference can be explained: a dashboard's state of charge hides a reserve at both ends.
+        // A smaller difference is normal, because a dashboard's state of charge hides a reserve at both ends.
         let is_odd = difference > HIDDEN_SOC && !is_confirmed;
         let severity = if is_odd { Severity::Warning } else { Severity::Note };
         find(judge, severity, Topic::ReportedSoc, format!("{} and {} disagree", own.name, signal.name))

@@ -18,7 +18,7 @@ const UNIT_FACTORS: [f64; 6] = [1e-3, 1e-2, 1e-1, 10.0, 100.0, 1000.0];
 const PLAUSIBLE_C: std::ops::RangeInclusive<f64> = -40.0..=60.0;
 /// Possible temperatures of a pack, even on fire or in extreme cold (degrees C).
 const POSSIBLE_C: std::ops::RangeInclusive<f64> = -60.0..=120.0;
-/// If the share of implausible readings is above this value, single disturbances do not explain these readings.
+/// Maximum share of implausible readings that single disturbances explain.
 const MANY: f64 = 0.01;
 
 pub(super) fn check(judge: &mut Judge<'_>) {
@@ -31,7 +31,6 @@ pub(super) fn check(judge: &mut Judge<'_>) {
     }
 }
 
-/// A signal and the layout that makes its values plausible.
 type BetterLayout<'d> = (SignalSeries<'d>, &'d AlternativeReading);
 
 /// The first alternative layout that fits at least three quarters of the signals, with the first signal that it fits.
@@ -133,7 +132,6 @@ fn better_voltages<'d>(judge: &Judge<'d>, all: &[SignalSeries<'d>]) -> Option<Be
     })
 }
 
-/// The alternative layout that makes the temperatures plausible or smooth, if the configured layout does not.
 fn better_temperatures<'d>(judge: &Judge<'d>, all: &[SignalSeries<'d>]) -> Option<BetterLayout<'d>> {
     let ambient_c = judge.plan.pack.ambient_c;
     let median_c = judge.median_of(Kind::Temperature, |series| series.values.median());
@@ -231,7 +229,8 @@ fn missing_offset(judge: &mut Judge<'_>, (signal, series): &SignalSeries<'_>) ->
     let on_bus =
         Series::of(series.values.kept().iter().zip(0_u32..).map(|(value, n)| (f64::from(n), Ok(sign * value))));
     let (low, high) = (on_bus.extent.min, on_bus.extent.max);
-    // A pack rests, or is charged and discharged, so that zero lies among the values. A factor explains other values.
+    // Zero lies among the values, because a pack rests, or is charged and discharged. A wrong factor explains other
+    // values.
     let is_among = |zero: &f64| *zero != 0.0 && (low..=high).contains(&(zero * factor));
     let Some(zero) = on_bus.zero_code(factor).filter(|zero| low > STEADY_A && is_among(zero)) else { return false };
     judge.is_mixed_up = true;
@@ -275,7 +274,6 @@ fn temperatures(judge: &mut Judge<'_>) {
     }
 }
 
-/// Whether many readings of a sensor are impossible temperatures.
 pub(super) fn is_impossible(series: &Series) -> bool {
     series.values.share(|c| !POSSIBLE_C.contains(&c)) > MANY
 }
@@ -354,8 +352,8 @@ fn unconverted(judge: &mut Judge<'_>, all: &[SignalSeries<'_>], median_c: f64) -
     Some(())
 }
 
-/// Reports readings outside the configured limits if no other finding explains them. The daemon will reject these
-/// readings: the limits are too tight, or the readings are disturbed.
+/// Reports readings outside the configured limits if no other finding explains them. Either the limits are too tight
+/// or the readings are disturbed. The daemon will reject these readings.
 pub(super) fn check_limits(judge: &mut Judge<'_>) {
     if judge.is_mixed_up || judge.has(&[Topic::Unit, Topic::Layout, Topic::Cell, Topic::CellCount]) {
         return;

@@ -1,4 +1,4 @@
-//! Damaged logs: no panic, and everything before the damage is read.
+//! Tests damaged logs: no panic, and everything before the damage is read.
 
 use super::{content, read_as, shown};
 use crate::{Format, Item};
@@ -34,8 +34,8 @@ fn log_cut_at_any_byte_gives_frames_before_the_cut() {
             let expected = frames(format, complete.as_bytes());
             let found = frames(format, &log.as_bytes()[..cut]);
             assert!(found.starts_with(&expected), "{format:?} cut at {cut}: {found:?}");
-            // The cut line gives nothing or a frame that is complete, except that formats without a length may have lost
-            // whole bytes of its data.
+            // The cut line gives either nothing or a frame. If the format states no length, this frame may have lost
+            // bytes at its end.
             let rest = &found[expected.len()..];
             let is_prefix = |frame: &String| whole[expected.len()].starts_with(frame.as_str());
             assert!(rest.len() <= 1 && rest.iter().all(is_prefix), "{format:?} cut at {cut}: {rest:?}");
@@ -72,7 +72,7 @@ fn any_change_of_a_byte_causes_no_panic() {
                 let mut changed = log.as_bytes().to_vec();
                 changed[at] = byte;
                 let _ = Format::recognise(&changed);
-                // A log of candump whose stamps are lost is refused.
+                // A candump log without stamps is refused.
                 if format != Format::Candump {
                     let _ = read_as(format, &changed);
                 }

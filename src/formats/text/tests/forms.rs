@@ -1,4 +1,4 @@
-//! Forms of lines that tools write.
+//! Tests the forms of lines that tools write.
 
 use super::{check, content, read};
 use crate::{Channel, Format, Item, Source, foreign};

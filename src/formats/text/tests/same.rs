@@ -1,4 +1,4 @@
-//! The same frames give the same items in every format.
+//! Tests that the same frames give the same items in every format.
 
 use packwatch_core::can::{CanId, Frame};
 use packwatch_core::quantity::Timestamp;

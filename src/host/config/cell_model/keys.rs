@@ -143,7 +143,6 @@ section! {
     }
 }
 
-/// Every table of a cell model file, in the order of the reference page.
 pub(crate) const SECTIONS: &[SectionInfo] = &[
     SectionInfo::one::<Head>(),
     SectionInfo::notes(

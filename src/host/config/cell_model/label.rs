@@ -18,7 +18,8 @@ pub fn of_label(label: &Label) -> Option<SourcedModel> {
     label.model().map(|model| SourcedModel { model, source })
 }
 
-/// Returns the model with which a vehicle of a fleet starts; `None` = the voltages are not plausible for the chemistry.
+/// Returns the initial model of a vehicle with a fleet prior. `None` = the voltages are not plausible for the
+/// chemistry.
 pub fn of_fleet(prior: FleetPrior) -> Option<SourcedModel> {
     let SourcedModel { source, .. } = of_label(&prior.label)?;
     let origin = format!("learned by {} other vehicles with cells of this label", prior.vehicles);

@@ -21,7 +21,6 @@ pub struct LibraryEntry {
 /// Returns the usual model folders that exist. `program` is the path of the program's executable.
 pub fn usual_folders(program: Option<&Path>) -> Vec<PathBuf> {
     let shipped = program.and_then(Path::parent).map(|folder| folder.join("../share/packwatch/cells"));
-    // Resolves the ".." in the path.
     let shipped = shipped.and_then(|folder| folder.canonicalize().ok());
     ["config/cells", "cells", "/etc/packwatch/cells"]
         .iter()

@@ -191,7 +191,6 @@ fn check_spread(spread: &SpreadKeys, tables: &Tables) {
     }
 }
 
-/// Checks that the table `key` has one row per temperature and one column per SOC breakpoint.
 fn check_shape(place: &TablePlace, key: &str, rows: &[Vec<f64>], tables: &Tables) {
     let (temperatures, socs) = (tables.temperature_c.len(), tables.soc.len());
     if rows.len() != temperatures {

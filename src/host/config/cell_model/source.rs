@@ -44,7 +44,7 @@ pub struct ModelSource {
     pub provenance: Table,
     /// For a model that is learned on board: the label's model, and the data behind the learned values.
     pub learned: Option<LearnedFrom>,
-    /// For a model of `pack.prior`: the prior.
+    /// The fleet prior of the key `pack.prior`, if the model starts from it.
     pub fleet: Option<Box<FleetPrior>>,
 }
 
@@ -66,7 +66,7 @@ pub struct LearnedFrom {
 }
 
 impl ModelSource {
-    /// A string of `[provenance]`; `None` = absent.
+    /// The first of `keys` that is a string in `[provenance]`.
     fn text(&self, keys: &[&str]) -> Option<&str> {
         keys.iter().find_map(|key| self.provenance.get(*key)?.as_str())
     }
@@ -76,7 +76,6 @@ impl ModelSource {
         self.text(&["citation", "source", "references"])
     }
 
-    /// Terms under which the data may be used.
     pub fn licence(&self) -> Option<&str> {
         self.text(&["licence"])
     }
@@ -96,7 +95,6 @@ impl ModelSource {
 /// A cell model and its origin.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SourcedModel {
-    /// The model.
     pub model: CellModel,
     /// The origin of the model.
     pub source: ModelSource,

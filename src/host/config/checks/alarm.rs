@@ -17,7 +17,6 @@ pub(crate) struct RatedCell {
 }
 
 impl RatedCell {
-    /// Computes the values from the rated capacity and the recharge window.
     pub(crate) fn new(capacity_ah: f64, recharge: &Recharge) -> Self {
         let recharge = recharge.config(capacity_ah);
         let window = recharge.to_soc - recharge.from_soc;
@@ -224,8 +223,7 @@ fn rounded(value: f64) -> f64 {
     format!("{value:.9e}").parse().unwrap_or(value)
 }
 
-/// Reports a threshold outside 0 to 1 for a value that is a fraction. The percent sign of the threshold is probably
-/// missing: every value, or no value, would exceed this threshold.
+/// Reports a threshold outside 0 to 1 for a value that is a fraction. Probably its percent sign is missing.
 fn check_unit(alarm: &Alarm, key: &str, set: f64) {
     let is_fraction = matches!(alarm.rule.spec().unit, Unit::Fraction | Unit::FractionPerDay);
     if is_fraction && !(0.0..=1.0).contains(&set) {

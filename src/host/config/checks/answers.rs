@@ -1,7 +1,7 @@
 //! Checks `[[input.diagnostic]]`: the diagnostic requests and answers, and the signals in the answers.
 //!
 //! Each of these tables becomes one [`AnswerDefinition`]. The signals of a definition look like signals of a DBC, so
-//! that `[input.*]` can name them in the same way. `polling` makes the answers that the core decodes.
+//! that `[input.*]` can name them in the same way. The module `polling` selects the answers that the core decodes.
 
 use crate::can::CanId;
 use crate::can::dbc::{FrameFormat, Message, Signal};
@@ -32,12 +32,10 @@ pub(crate) struct AnswerDefinition {
     first_bytes: Vec<usize>,
 }
 
-/// Position of a signal in an answer.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct AnswerPlace<'d> {
-    /// The answer.
     pub definition: &'d AnswerDefinition,
-    /// First byte, counted after the echoed service and identifier.
+    /// First byte of the signal, counted after the echoed service and identifier.
     pub first_byte: usize,
 }
 
@@ -70,7 +68,7 @@ impl AnswerPlace<'_> {
         AnswerSource { question: self.definition.question(bus), first_byte: self.first_byte }
     }
 
-    /// Position of the signal's first bit in the answer, counted like the key `bit`.
+    /// Position of the signal's first bit in the answer, counted like the configuration key `bit`.
     pub(crate) fn bit(&self, layout: &SignalLayout) -> usize {
         let in_byte = match layout.byte_order {
             ByteOrder::BigEndian => 7 - layout.start_bit,

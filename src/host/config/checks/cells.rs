@@ -75,7 +75,8 @@ fn fleet_prior(path: &Path, pack: &Pack, read: ReadFile<'_>) -> Option<FleetPrio
     let parsed = read(&file).map_err(|error| error.to_string()).and_then(|bytes| {
         let text = String::from_utf8(bytes).map_err(|error| error.to_string())?;
         let table: toml::Table = text.parse().map_err(|error: toml::de::Error| error.message().to_owned())?;
-        // The program reads stored models from JSON; a second reader would make it larger.
+        // Deserialises through JSON, as for stored models. A second deserialiser of these types would enlarge the
+        // program.
         let json = serde_json::to_vec(&table).map_err(|error| error.to_string())?;
         let prior: FleetPrior = serde_json::from_slice(&json).map_err(|error| error.to_string())?;
         prior.check().map_err(|error| error.to_string())?;
@@ -138,7 +139,6 @@ fn check_file(place: &TablePlace, cell_model: Option<&String>) -> bool {
     !given.is_empty()
 }
 
-/// Reports label keys of the pack that are given together with a model file.
 pub(crate) fn check(pack: &Pack) {
     check_file(&pack.place, pack.cell_model.as_ref());
 }

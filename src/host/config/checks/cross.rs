@@ -16,7 +16,6 @@ const MAX_INTERFACE_NAME: usize = 15;
 /// Maximum number of characters in the name of a vehicle or pack, because one status line shows name, id and pack.
 const MAX_VEHICLE_TEXT: usize = 64;
 
-/// Reports keys that contradict each other.
 pub(crate) fn check(raw: &RawTables, model: Option<&CellModel>) {
     vehicle(raw);
     interfaces(raw);

@@ -1,7 +1,7 @@
 //! Checks interface names and signal names in the input tables, even in a table that has another fault.
 //!
-//! In: the document, because a faulty table is not in [`RawTables`] but must still be checked, so that every fault is
-//! reported at once.
+//! The input is the document, because [`RawTables`] does not contain faulty tables. Their names must be checked too, so
+//! that every fault is reported at once.
 
 use std::collections::BTreeSet;
 
@@ -13,7 +13,6 @@ use crate::config::schema::keys::{CurrentInput, Interface, SignalSource};
 use crate::config::schema::{RawTables, SECTIONS};
 use crate::config::schema::{Section as _, SectionInfo};
 
-/// Reports unknown interface names, and missing names if there are several interfaces.
 pub(crate) fn interfaces(document: &Document<'_>, raw: &RawTables) {
     if raw.broken {
         return;
@@ -41,7 +40,6 @@ pub(crate) fn interfaces(document: &Document<'_>, raw: &RawTables) {
     }
 }
 
-/// Reports unknown signals in tables that have another fault.
 pub(crate) fn signals(document: &Document<'_>, raw: &RawTables, databases: &Databases) {
     let read: BTreeSet<&str> = raw.places().map(|place| place.path.as_str()).collect();
     for (place, table) in with_key("signal").flat_map(|info| tables(document, info)) {

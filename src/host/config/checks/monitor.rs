@@ -20,8 +20,8 @@ use crate::monitor::{MonitorConfig, SupplyConfig};
 use crate::quantity::{BusIndex, SensorIndex};
 use crate::sample::{ContactorConfig, Limits, SampleConfig, VoltageSource};
 
-/// The settings of the core and the layout of the sent frames; `None` if a table is missing or faulty (reported).
-/// `inputs_whole` states whether every configured signal was found.
+/// The settings of the core and the layout of the sent frames. If a table is missing or faulty (reported), the result
+/// is `None`. `inputs_whole` states whether every configured signal was found.
 pub(crate) fn monitor(
     raw: &RawTables,
     signals: &[ResolvedSignal<'_>],
@@ -106,7 +106,7 @@ fn health(raw: &RawTables, pack: &Pack, rated_ah: f64) -> Option<HealthConfig> {
     })
 }
 
-/// Cycle times of the input messages as stated by the DBC files (s).
+/// Cycle times (s) of the input messages, from the DBC files.
 fn cycle_times_s(found: &[ResolvedSignal<'_>]) -> Vec<(BusIndex, CanId, f64)> {
     let in_frames = found.iter().filter(|resolved| resolved.answer.is_none());
     let times = in_frames.filter_map(|resolved| {
@@ -153,7 +153,7 @@ fn reported_limits(max_age_s: f64) -> Limits {
     Limits { min: -0.1, max: 1.5, max_rate_per_s: None, stuck_after_s: None, max_age_s }
 }
 
-/// The sensor of each cell; a sensor without `cells` serves all cells.
+/// The sensor of each cell. A sensor without the key `cells` serves all cells.
 fn sensors(temperatures: &[TemperatureInput], cells: u16) -> Vec<Option<SensorIndex>> {
     let mut sensor_of_cell = vec![None; usize::from(cells)];
     for (index, temperature) in (0..).zip(temperatures) {

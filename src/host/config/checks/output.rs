@@ -20,7 +20,6 @@ use crate::cell::CellModel;
 use crate::monitor::OutputConfig;
 use crate::quantity::BusIndex;
 
-/// The messages that are sent.
 const SENT: [LayoutMessage; 6] = [
     LayoutMessage::Status,
     LayoutMessage::Health,
@@ -69,8 +68,8 @@ pub(crate) fn output(
         }
         None => None,
     };
-    // If the cell model is missing, this fault is already reported. Any capacity is then good enough to find further
-    // faults of the layout.
+    // A missing cell model has already been reported. In that case, any capacity is good enough to find further faults
+    // of the layout.
     let rated_capacity_ah = raw.rated_ah(model).unwrap_or(1.0);
     let base = own.as_ref().map_or(LayoutBase::BuiltIn { rated_capacity_ah }, LayoutBase::Own);
     let refuse = |fault: &SettingFault| {
@@ -108,7 +107,7 @@ pub(crate) fn output(
     Some((output, database))
 }
 
-/// The settings of a frame's message; `None` = faults reported.
+/// The settings of a frame's message. If a key is faulty, reports it and returns `None`.
 pub(crate) fn message_settings(keys: &FrameKeys<'_>) -> Option<MessageSettings> {
     let id = match keys.id {
         Some(id) => Some(configured_id(keys, id)?),
@@ -149,7 +148,7 @@ fn protection(keys: &FrameKeys<'_>) -> Option<E2eSetting> {
     Some(E2eSetting::On(Protection { profile, data_id }))
 }
 
-/// The authentication of a frame; `None` = faults reported.
+/// The authentication of a frame; the outer `None` = a fault is reported.
 fn authentication(keys: &FrameKeys<'_>) -> Option<Option<Authentication>> {
     let Some(profile) = keys.secoc else { return Some(None) };
     if keys.data_id.is_none() {
@@ -158,8 +157,8 @@ fn authentication(keys: &FrameKeys<'_>) -> Option<Option<Authentication>> {
     keys.data_id.map(|data_id| Some(Authentication { profile, data_id }))
 }
 
-/// Reports SecOC profiles that only commands may use. A sent frame needs more bits of freshness, because this program
-/// may restart.
+/// Reports a SecOC profile other than "fd" for a sent frame. The other profiles have too few bits of freshness for a
+/// sender that may restart.
 fn check_sent_secoc(keys: &FrameKeys<'_>) {
     if keys.secoc.is_some_and(|profile| profile != secoc::Profile::Fd) {
         keys.place.fault("secoc", "must be \"fd\" for a frame that is sent");
@@ -197,7 +196,6 @@ fn freshness_settings(keys: &FrameKeys<'_>, command: Option<&MessageSettings>) -
     is_good.then_some(settings)
 }
 
-/// The keys of the table that configures a message.
 fn keys_of<'k, 'a>(frames: &'k [(LayoutMessage, FrameKeys<'a>)], message: LayoutMessage) -> Option<&'k FrameKeys<'a>> {
     frames.iter().find(|(which, _)| *which == message).map(|(_, keys)| keys)
 }
@@ -231,7 +229,6 @@ fn check_ids(
     }
 }
 
-/// The interfaces on which frames are sent.
 fn buses(raw: &RawTables, keys: &Output) -> Vec<BusIndex> {
     let wanted = |name: &str| keys.interfaces.as_ref().is_none_or(|names| names.iter().any(|n| n == name));
     let indexed = (0..).zip(&raw.interfaces).filter(|(_, interface)| wanted(&interface.name));

@@ -1,7 +1,6 @@
 //! Parses and matches signal name patterns such as `CellVoltages{m}.CellVoltage{n}`, where `{n}` is the cell's number
 //! and `{m}` any number.
 
-/// One piece of a pattern.
 #[derive(Debug, Clone, PartialEq, Eq)]
 enum PatternPiece {
     Text(String),
@@ -11,7 +10,6 @@ enum PatternPiece {
     Any,
 }
 
-/// A parsed pattern.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Pattern(Vec<PatternPiece>);
 

@@ -16,10 +16,9 @@ use crate::quantity::{Channel, bounds};
 use crate::sample::Limits;
 
 /// Two cells count as different if the ratio of their rated capacities (larger over smaller) is at least this number.
-/// The estimator learns resistances up to the same multiple of the model's resistances.
+/// The estimator has the same limit for learned resistances relative to the model's resistances.
 const OTHER_CELL: f64 = 3.0;
 
-/// Reports implausible signals.
 pub(crate) fn signals(raw: &RawTables, found: &[ResolvedSignal<'_>], model: Option<&CellModel>) {
     let series = raw.pack.as_ref().map_or(1, |pack| pack.cells);
     for (place, signals) in by_table(raw, found) {
@@ -71,7 +70,6 @@ fn reach(place: &TablePlace, signals: &[&ResolvedSignal<'_>], pack: (Option<&Cel
     place.fault(if place.has("scale") { "scale" } else { "signal" }, &what);
 }
 
-/// The signals of each table, in the order of the file.
 fn by_table<'r, 'd>(
     raw: &'r RawTables,
     found: &'r [ResolvedSignal<'d>],
@@ -87,7 +85,7 @@ fn by_table<'r, 'd>(
     tables
 }
 
-/// Returns the name `Message.Signal` of a signal that is in the same message as the resolved signal.
+/// Full name `Message.Signal` of a signal in the resolved signal's message.
 fn name(resolved: &ResolvedSignal<'_>, signal: &Signal) -> String {
     format!("{}.{}", resolved.message.name, signal.name)
 }
@@ -114,7 +112,7 @@ fn unreadable(place: &TablePlace, signals: &[&ResolvedSignal<'_>]) {
     }
 }
 
-/// Reports signals that extend beyond their message, and multiplexors of these signals that do so: one fault per table.
+/// Reports signals, and multiplexors of these signals, that extend beyond their message. Reports one fault per table.
 fn ends(place: &TablePlace, signals: &[&ResolvedSignal<'_>]) {
     // The length of an answer is unknown until it arrives.
     let in_frames = signals.iter().filter(|resolved| resolved.answer.is_none());
@@ -214,12 +212,11 @@ fn has_bits_of(a: &ResolvedSignal<'_>, b: &ResolvedSignal<'_>) -> bool {
     }
 }
 
-/// Whether two inclusive ranges overlap.
 fn ranges_overlap(a: (u64, u64), b: (u64, u64)) -> bool {
     a.0 <= b.1 && b.0 <= a.1
 }
 
-/// Returns the quantity that a channel needs, and the unit of this quantity; `None` = any quantity.
+/// Returns the quantity that a channel needs, and its unit; `None` = any quantity.
 fn needed(channel: Channel) -> Option<(Quantity, &'static str)> {
     match channel {
         Channel::Current => Some((Quantity::Current, "A")),
@@ -258,7 +255,6 @@ fn units(place: &TablePlace, signals: &[&ResolvedSignal<'_>], pack: (Option<&Cel
     }
 }
 
-/// Whether the configuration converts the DBC's values by `scale` or `offset`.
 fn is_converted(place: &TablePlace) -> bool {
     place.has("scale") || place.has("offset")
 }
@@ -417,7 +413,6 @@ fn voltages_of_model(range: &AllowedRange<'_>, model: &CellModel) {
     }
 }
 
-/// Reports an initial capacity that is impossible for the cell model.
 pub(crate) fn initial_capacity(raw: &RawTables, model: Option<&CellModel>) {
     let (Some(pack), Some(model)) = (&raw.pack, model) else { return };
     initial_of(&pack.place, pack.initial_capacity_ah, model);

@@ -9,8 +9,8 @@ use crate::config::schema::did_you_mean;
 use crate::config::schema::keys::ProtectedInput;
 use crate::quantity::{BusIndex, Channel};
 
-/// Returns the guards of the protected messages; faults are reported. `inputs_whole` states whether every configured
-/// signal was found. Only then does a missing message mean that the configured name is wrong.
+/// Returns the guards of the protected messages, and reports faults. If a configured signal was not found
+/// (`inputs_whole` is false), a missing message is not reported, because its name may be correct.
 pub(crate) fn guards(raw: &RawTables, found: &[ResolvedSignal<'_>], inputs_whole: bool) -> Vec<GuardConfig> {
     let mut guards: Vec<(GuardConfig, &ProtectedInput)> = Vec::new();
     for keys in &raw.protected {
@@ -51,8 +51,8 @@ pub(crate) fn guards(raw: &RawTables, found: &[ResolvedSignal<'_>], inputs_whole
     guards
 }
 
-/// A reading with a new pack identity sets all learned values aside. The message with the identity must therefore be
-/// protected, unless the configuration sets `accept_unprotected`.
+/// Reports a message with the pack identity that is not protected, unless `accept_unprotected` is set. A forged
+/// identity would set aside all learned values.
 fn check_identity(raw: &RawTables, found: &[ResolvedSignal<'_>], guards: &[GuardConfig]) {
     let Some(keys) = raw.pack_identity.as_ref().filter(|keys| !keys.accept_unprotected) else { return };
     let is_protected =

@@ -20,14 +20,12 @@ use crate::config::schema::did_you_mean;
 use crate::config::schema::keys::{CurrentSign, DiagnosticInput, PositiveCurrent, SignalSource, SourceAddress};
 use crate::quantity::{BusIndex, CellIndex, Channel};
 
-/// Largest number of cell numbers listed in one fault.
 const MAX_NAMED_CELLS: usize = 8;
 
 /// Largest length of a pack identity, bits. A reading is a 64-bit float, which represents integers of up to 53 bits
 /// exactly.
 const MAX_IDENTITY_BITS: u16 = 53;
 
-/// The DBC files and diagnostic answers of a configuration.
 #[derive(Debug)]
 pub(crate) struct Databases {
     files: Vec<(String, Database)>,
@@ -41,7 +39,6 @@ pub(crate) struct NamedSignal<'d> {
     pub file: &'d str,
     /// The message that contains the signal.
     pub message: &'d Message,
-    /// The signal.
     pub signal: &'d Signal,
     /// Position of the signal in its answer; `None` if the signal is in a DBC file.
     pub answer: Option<AnswerPlace<'d>>,
@@ -59,7 +56,6 @@ impl NamedSignal<'_> {
     }
 }
 
-/// A configured signal that was found.
 #[derive(Debug, Clone)]
 pub(crate) struct ResolvedSignal<'d> {
     /// Input that the signal feeds.
@@ -70,7 +66,6 @@ pub(crate) struct ResolvedSignal<'d> {
     pub file: &'d str,
     /// The message that contains the signal.
     pub message: &'d Message,
-    /// The signal.
     pub signal: &'d Signal,
     /// Position of the signal in its answer; `None` if the signal is in a DBC file.
     pub answer: Option<AnswerPlace<'d>>,
@@ -102,12 +97,11 @@ pub(crate) struct DbcRanges {
 /// Length of the longest CAN FD frame, bytes.
 const MAX_FRAME_BYTES: u16 = 64;
 
-/// A range that contains every value.
 pub(crate) const UNLIMITED: (f64, f64) = (f64::NEG_INFINITY, f64::INFINITY);
 
 impl Databases {
-    /// Reads the DBC files and the answers. Returns `None` if there are no files and no answers, or if a file or an
-    /// answer is unusable (reported), because signals cannot be looked up in that case.
+    /// Reads the DBC files and the answers. If there are no files and no answers, or if one of them is unusable
+    /// (reported), signals cannot be looked up. The result is then `None`.
     pub(crate) fn load(config: &Path, raw: &RawTables, read: ReadFile<'_>) -> Option<Self> {
         let mut files = Vec::new();
         for (input, name) in raw.input.iter().flat_map(|input| input.dbc.iter().map(move |name| (input, name))) {
@@ -139,7 +133,7 @@ impl Databases {
         of_files.chain(of_answers)
     }
 
-    /// Returns another message of the same file with the same identifier as `message`; `None` = not found.
+    /// Returns another message of the same file with the same identifier as `message`.
     fn twin(&self, file: &str, message: &Message) -> Option<&Message> {
         let databases = self.files.iter().filter(|(name, _)| name == file).map(|(_, database)| database);
         let mut messages = databases.flat_map(|database| &database.messages);
@@ -153,8 +147,8 @@ impl Databases {
     }
 }
 
-/// Reads one DBC file; `None` = the file cannot be read (reported). Parts of the file that are left out are reported by
-/// `report`.
+/// Reads one DBC file. If the file cannot be read, adds a fault and returns `None`. Calls `report` for each part of the
+/// file that is left out.
 pub(crate) fn read_dbc(
     path: &Path,
     read: ReadFile<'_>,
@@ -175,7 +169,6 @@ pub(crate) fn read_dbc(
     Some(database)
 }
 
-/// Finds every configured signal.
 pub(crate) fn resolve<'d>(raw: &RawTables, databases: &'d Databases) -> Vec<ResolvedSignal<'d>> {
     let mut search = Search { raw, databases, found: Vec::new() };
     for (channel, source) in raw.sources() {
@@ -195,14 +188,14 @@ pub(crate) fn resolve<'d>(raw: &RawTables, databases: &'d Databases) -> Vec<Reso
     search.found
 }
 
-/// Reports a signal name that is neither in the DBC files nor in the diagnostic answers.
 pub(crate) fn check_name(raw: &RawTables, databases: &Databases, source: &SignalSource<'_>) {
     if !databases.signals().any(|signal| signal.is_named(source.signal)) {
         Search { raw, databases, found: Vec::new() }.not_found(source);
     }
 }
 
-/// Returns 1 or -1: the factor from the sign of the current on the bus to packwatch's sign. A magnitude has no sign.
+/// Returns 1 or -1, the factor from the current's sign on the bus to packwatch's sign. The factor is 1 if another
+/// signal gives the direction.
 fn current_sign(raw: &RawTables) -> f64 {
     match raw.current.as_ref().and_then(|keys| keys.positive) {
         Some(PositiveCurrent::Charge) if !raw.is_written::<CurrentSign>() => -1.0,
@@ -217,7 +210,6 @@ struct Search<'s, 'd> {
 }
 
 impl<'d> Search<'_, 'd> {
-    /// Looks up one signal by name.
     fn one(&mut self, channel: Channel, source: &SignalSource<'_>, sign: f64) {
         let name = source.signal;
         let hits: Vec<NamedSignal<'d>> = self.databases.signals().filter(|signal| signal.is_named(name)).collect();
@@ -238,7 +230,7 @@ impl<'d> Search<'_, 'd> {
         self.left_out(source.signal);
     }
 
-    /// Reports why the message of a signal was left out of its file.
+    /// If the message of a signal was left out of its DBC file, reports why.
     fn left_out(&self, signal: &str) {
         let Some((message, _)) = signal.split_once('.') else { return };
         let beginning = format!("message {message} is left out: ");
@@ -409,8 +401,7 @@ fn list(numbers: &[u32]) -> String {
 }
 
 impl ResolvedSignal<'_> {
-    /// The signal's binding for the decoder. Only the DBC limits the range, because the sample stage checks
-    /// plausibility.
+    /// The signal's binding for the decoder. Its range is the DBC's range; the sample stage checks plausibility later.
     pub(crate) fn binding(&self) -> Result<Binding, LayoutFault> {
         let mut binding = Binding::new(self.bus, self.message, self.signal, self.channel)?;
         binding.scale = self.scale;
@@ -440,8 +431,8 @@ impl ResolvedSignal<'_> {
     }
 }
 
-/// The map from frames to inputs for the decoder, without the diagnostic answers. `None` if a layout cannot be decoded;
-/// `plausible` has reported this.
+/// The map from frames to inputs for the decoder, without the diagnostic answers. If a layout cannot be decoded, the
+/// result is `None`; the module `plausible` has reported this fault.
 pub(crate) fn input_map(found: &[ResolvedSignal<'_>]) -> Option<InputMap> {
     let in_frames = found.iter().filter(|resolved| resolved.answer.is_none());
     let bindings: Result<Vec<_>, _> = in_frames.map(ResolvedSignal::binding).collect();

@@ -44,7 +44,6 @@ fn sections(page: &mut String, sections: &[SectionInfo]) {
     }
 }
 
-/// Name, value, unit and default, on one line.
 fn head(key: &Key) -> String {
     let unit = if key.unit.is_empty() { String::new() } else { format!(" ({})", key.unit) };
     let default = match reference::default(key) {

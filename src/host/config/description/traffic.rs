@@ -1,4 +1,4 @@
-//! Describes the frames that are received, checked, requested and sent.
+//! Describes for `packwatch check` which frames are received, checked, requested and sent.
 
 use serde::Serialize;
 
@@ -31,12 +31,10 @@ pub struct OutputUse {
     pub authentication: String,
 }
 
-/// An authentication in words.
 fn authentication_words(Authentication { profile, data_id }: Authentication) -> String {
     format!("SecOC {}, data id {data_id:#X}", profile.name())
 }
 
-/// Describes the sent frames.
 pub(crate) fn outputs(config: &Config) -> Vec<OutputUse> {
     let Some(output) = &config.monitor.output else { return Vec::new() };
     let names: Vec<String> = output.buses.iter().map(|bus| config.interface_name(*bus).to_owned()).collect();
@@ -68,7 +66,6 @@ pub fn command_words(config: &Config) -> String {
     }
 }
 
-/// Describes how frames are checked before they are decoded.
 pub(crate) fn intake(config: &Config, found: &[ResolvedSignal<'_>]) -> Vec<String> {
     let monitor = &config.monitor;
     let rate = monitor.flood.max_frames_per_s;
@@ -98,7 +95,6 @@ pub(crate) fn intake(config: &Config, found: &[ResolvedSignal<'_>]) -> Vec<Strin
     }
     words
 }
-/// Describes what polling sends.
 pub(crate) fn polling(config: &Config) -> Vec<String> {
     let Some(poll) = &config.monitor.poll else { return Vec::new() };
     let mut words: Vec<String> = poll.requests.iter().map(|request| request_words(config, request)).collect();

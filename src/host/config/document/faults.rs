@@ -12,7 +12,6 @@ use std::rc::Rc;
 #[error("{}", .0.join("\n"))]
 pub struct ConfigFaults(pub Vec<String>);
 
-/// A line of a file.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) struct SourceLine {
     /// File, as the user named it.
@@ -46,7 +45,7 @@ pub(crate) struct Faults(Rc<RefCell<Notes>>);
 struct Notes {
     faults: Vec<(SourceLine, String)>,
     warnings: Vec<(SourceLine, String)>,
-    /// All faults and warnings, to leave out repetitions.
+    /// All faults and warnings so far, to skip repetitions.
     noted: BTreeSet<(bool, SourceLine, String)>,
 }
 
@@ -65,7 +64,6 @@ impl Faults {
         self.add_at(&SourceLine { file: file.to_owned(), line }, text);
     }
 
-    /// Adds the fault `text` at a line.
     pub(crate) fn add_at(&self, at: &SourceLine, text: impl fmt::Display) {
         self.0.borrow_mut().note(true, at, text);
     }
@@ -75,12 +73,10 @@ impl Faults {
         self.0.borrow_mut().note(false, at, text);
     }
 
-    /// Number of faults.
     pub(crate) fn len(&self) -> usize {
         self.0.borrow().faults.len()
     }
 
-    /// Whether there are no faults.
     pub(crate) fn is_empty(&self) -> bool {
         self.len() == 0
     }
@@ -125,20 +121,17 @@ pub(crate) struct KeyPlace {
 pub(crate) struct TablePlace {
     /// File and line of the table's header.
     pub at: SourceLine,
-    /// `input.current`, `alarm[2]`; empty for the top of the file.
+    /// Path of the table, such as `input.current` or `alarm[2]`; empty for the top of the file.
     pub path: String,
     pub spots: BTreeMap<String, KeyPlace>,
-    /// The list to which faults are added.
     pub faults: Faults,
 }
 
 impl TablePlace {
-    /// Full name of a key of this table.
     pub(crate) fn key(&self, key: &str) -> String {
         if self.path.is_empty() { key.to_owned() } else { format!("{}.{key}", self.path) }
     }
 
-    /// Whether the file sets the key.
     pub(crate) fn has(&self, key: &str) -> bool {
         self.spots.contains_key(key)
     }

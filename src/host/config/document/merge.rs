@@ -20,7 +20,6 @@ pub(crate) struct Document<'t> {
     pub file: String,
     /// Whether a file has a syntax fault. If so, a key that was not found may be in the part that could not be parsed.
     pub broken: bool,
-    /// The list to which faults are added.
     pub faults: Faults,
     sources: &'t Sources,
     root: DeTable<'t>,
@@ -41,12 +40,10 @@ impl<'t> Document<'t> {
         Self { file: sources.main_file().to_owned(), broken, faults: faults.clone(), sources, root }
     }
 
-    /// The root table.
     pub(crate) fn root(&self) -> &DeTable<'t> {
         &self.root
     }
 
-    /// The value at a dotted path.
     pub(crate) fn find(&self, path: &str) -> Option<&Spanned<DeValue<'t>>> {
         let mut parts = path.split('.');
         let mut value = self.root.get(parts.next()?)?;
@@ -57,7 +54,6 @@ impl<'t> Document<'t> {
         Some(value)
     }
 
-    /// The first line of the main file.
     pub(crate) fn first_line(&self) -> SourceLine {
         SourceLine { file: self.file.clone(), line: 1 }
     }
@@ -67,7 +63,6 @@ impl<'t> Document<'t> {
         self.sources.line(span)
     }
 
-    /// The source text at `span`.
     pub(crate) fn written(&self, span: &Range<usize>) -> &'t str {
         self.sources.written(span)
     }
@@ -104,7 +99,7 @@ impl<'t> Document<'t> {
 
 fn note_syntax(source: &SourceFile, table: &DeTable<'_>, errors: &[toml::de::Error], faults: &Faults) {
     let line = |error: &toml::de::Error| error.span().map_or(0, |span| source.line(&span));
-    // The first fault is often the cause of the others.
+    // Sorts the faults by line, because the first fault is often the cause of the others.
     let mut errors: Vec<&toml::de::Error> = errors.iter().collect();
     errors.sort_by_key(|&error| line(error));
     for &error in errors.iter().take(MAX_SYNTAX_FAULTS) {
@@ -128,8 +123,8 @@ fn duplicate(source: &SourceFile, table: &DeTable<'_>, again: &Range<usize>) -> 
     Some(format!("the key {name} is set twice, first in line {first}"))
 }
 
-/// The last position before `end` at which a key `name` is set. Within one table, this is the key that a duplicate
-/// repeats.
+/// The last position before `end` at which a key `name` is set. For a duplicate key, this is the earlier setting in the
+/// same table.
 fn last_use(table: &DeTable<'_>, name: &str, end: usize) -> Option<Range<usize>> {
     let below = |value: &Spanned<DeValue<'_>>| match value.get_ref() {
         DeValue::Table(table) => last_use(table, name, end),
@@ -175,7 +170,7 @@ pub(crate) fn is_list_of_tables(value: &Spanned<DeValue<'_>>) -> bool {
     items.is_some_and(|items| !items.is_empty() && items.iter().all(|item| item.get_ref().is_table()))
 }
 
-/// `text`, shortened to the length of a quotation.
+/// Shortens `text` to [`MAX_QUOTE`] characters.
 pub(crate) fn shorten(text: &str) -> String {
     match text.char_indices().nth(MAX_QUOTE) {
         Some((end, _)) => format!("{}...", &text[..end]),

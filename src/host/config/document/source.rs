@@ -61,7 +61,7 @@ fn drop_in_folder(main: &Path) -> PathBuf {
     PathBuf::from(name)
 }
 
-/// The drop-ins in a folder, sorted by name; none if the folder does not exist.
+/// The drop-ins in a folder, sorted by name. Empty if the folder does not exist.
 fn list(folder: &Path) -> io::Result<Vec<PathBuf>> {
     let entries = match std::fs::read_dir(folder) {
         Ok(entries) => entries,
@@ -89,7 +89,6 @@ pub(crate) struct SourceFile {
 }
 
 impl SourceFile {
-    /// Name, as the user gave it.
     pub(crate) fn name(&self) -> &str {
         &self.name
     }
@@ -112,7 +111,7 @@ pub(crate) struct Sources {
 }
 
 impl Sources {
-    /// Reads all files; `None` = at least one file cannot be read (reported).
+    /// Reads all files. If a file cannot be read, reports a fault and returns `None`.
     pub(crate) fn read(files: &ConfigFiles, read: ReadFile<'_>, faults: &Faults) -> Option<Self> {
         let text = |path: &Path| Some((path.display().to_string(), read_text(path, read, faults)?));
         // Reads every file before returning, so that each fault is reported.
@@ -123,8 +122,7 @@ impl Sources {
     fn new(texts: Vec<(String, String)>) -> Self {
         let (mut files, mut start) = (Vec::new(), 0);
         for (name, text) in texts {
-            // A byte order mark is valid only at the start of a text. In the padded text, the mark would follow the
-            // blanks, so the mark is removed.
+            // A byte order mark is valid only at the start of a text, but would follow the blanks in the padded text.
             let text = text.strip_prefix('\u{feff}').unwrap_or(&text);
             let placed = " ".repeat(start) + text;
             let end = placed.len();
@@ -139,7 +137,6 @@ impl Sources {
         &self.files
     }
 
-    /// Name of the main file.
     pub(crate) fn main_file(&self) -> &str {
         self.files.first().map_or("", |file| &file.name)
     }
@@ -167,8 +164,8 @@ pub(crate) fn beside(path: &Path, named: &str) -> PathBuf {
     path.parent().unwrap_or(Path::new("")).join(named)
 }
 
-/// Returns `, did you mean FILE` if a missing file `named` resembles a file with the same extension. The folders searched
-/// are the named folder, the folder of `config`, and the folders directly below that folder.
+/// Returns `, did you mean FILE` if the missing file `named` resembles a file with the same extension. Searches the
+/// named folder, the folder of `config`, and the folders directly below that folder.
 pub(crate) fn meant_file(config: &Path, named: &str) -> String {
     /// Largest number of folders and of files that are searched.
     const MOST: usize = 1000;
@@ -184,7 +181,7 @@ pub(crate) fn meant_file(config: &Path, named: &str) -> String {
     let own = paths(&folder);
     let below = own.iter().filter(|path| path.is_dir()).flat_map(|folder| paths(folder));
     let of_named = path.parent().map(paths).unwrap_or_default();
-    // The ending is equal in all names, so it must not count as likeness.
+    // All candidates have the same extension, so only the names before it are compared.
     let name_of = |path: &Path| path.file_stem().and_then(|name| name.to_str()).map(str::to_owned);
     let is_alike = |other: &PathBuf| other.extension() == path.extension() && *other != path && other.is_file();
     let files = of_named.into_iter().chain(own.clone()).chain(below).filter(is_alike).take(MOST);
@@ -200,7 +197,7 @@ pub(crate) fn read_file(path: &Path) -> std::io::Result<Vec<u8>> {
     bounded_file::read(path)
 }
 
-/// The file as UTF-8 text; `None` = the file cannot be read or is not UTF-8 (reported).
+/// The file as UTF-8 text. If it cannot be read or is not UTF-8, reports a fault and returns `None`.
 pub(crate) fn read_text(path: &Path, read: ReadFile<'_>, faults: &Faults) -> Option<String> {
     let file = path.display().to_string();
     let bytes = read(path).map_err(|error| faults.add(&file, 0, format!("cannot be read: {error}"))).ok()?;

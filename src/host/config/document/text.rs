@@ -1,5 +1,4 @@
-//! Writes the merged tables of a configuration as one TOML text for people. Comments in this text state the file and
-//! line of each key and table.
+//! Writes the merged tables of a configuration as one TOML text for people.
 
 use std::fmt::Write as _;
 use std::path::Path;
@@ -68,12 +67,12 @@ fn tables_at(document: &Document<'_>, path: &str, value: &Spanned<DeValue<'_>>, 
     }
 }
 
-/// Whether a value is written under a header: a table, or a list of tables, that is not written inline.
+/// Whether a value is written under a header. This holds for tables and lists of tables that are not inline.
 fn has_header(document: &Document<'_>, value: &Spanned<DeValue<'_>>) -> bool {
     (value.get_ref().is_table() || is_list_of_tables(value)) && !is_inline(document, value)
 }
 
-/// Whether the text of a value at its position contains the whole value. This is not so if a table has a header, or if
+/// Whether the text of a value at its position contains the whole value. It does not if the table has a header, or if
 /// another file adds keys or elements to the value.
 fn is_inline(document: &Document<'_>, value: &Spanned<DeValue<'_>>) -> bool {
     let (span, written) = (value.span(), document.written(&value.span()));

@@ -21,7 +21,6 @@ pub(crate) struct PartialConfig {
     pub raw: RawTables,
     /// The DBC files and diagnostic answers.
     pub databases: Databases,
-    /// The cell model.
     pub model: Option<CellModel>,
 }
 
@@ -36,7 +35,7 @@ impl PartialConfig {
             Ok(config) => (Some(config), Vec::new()),
             Err(faults) => (None, faults.0),
         };
-        // The tables are read a second time here, which finds the same faults again. This list of faults is not used.
+        // Reading the tables a second time finds the same faults again, so this list of faults is ignored.
         let again = Faults::default();
         let read = || {
             let sources = Sources::read(&ConfigFiles::find(path).ok()?, read_file, &again)?;
@@ -52,7 +51,6 @@ impl PartialConfig {
         }
     }
 
-    /// The configured signals that were found in the DBC files and diagnostic answers.
     pub(crate) fn signals(&self) -> Vec<ResolvedSignal<'_>> {
         signals::resolve(&self.raw, &self.databases)
     }

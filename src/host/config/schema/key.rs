@@ -1,4 +1,4 @@
-//! Defines the properties of a declared key (meaning, type, range), and reads the value of a key from a table.
+//! Defines the properties of a declared key (meaning, type, range), and reads its value from a table.
 
 use std::fmt;
 use std::ops::Range;
@@ -23,7 +23,7 @@ pub(crate) enum ValueRange {
     NotEmpty,
 }
 
-/// The range of alarm thresholds and of the factors and offsets of signals. No sensible value is outside this range.
+/// The range of alarm thresholds and of signal factors and offsets. No sensible value is outside this range.
 const WIDEST: ValueRange = ValueRange::Between(-1e9, 1e9);
 
 /// The range of a key with physical bounds.
@@ -56,36 +56,32 @@ impl fmt::Display for ValueRange {
     }
 }
 
-/// Why and where a value is rejected.
+/// Why a value is rejected, with the byte range of the value in the file.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum ValueFault {
-    /// The value has the wrong type.
     Type(Range<usize>),
-    /// The value has the right type but is out of range.
     Range(Range<usize>),
 }
 
-/// Returns the contents of `found`. If `found` is `None`, returns a type fault at the position of `value`.
+/// Returns the contents of `found`, or a type fault at the position of `value`.
 pub(crate) fn typed<T>(value: &Spanned<DeValue<'_>>, found: Option<T>) -> Result<T, ValueFault> {
     found.ok_or_else(|| ValueFault::Type(value.span()))
 }
 
-/// Returns the contents of `found`. If `found` is `None`, returns a range fault at the position of `value`.
+/// Returns the contents of `found`, or a range fault at the position of `value`.
 pub(crate) fn in_range<T>(value: &Spanned<DeValue<'_>>, found: Option<T>) -> Result<T, ValueFault> {
     found.ok_or_else(|| ValueFault::Range(value.span()))
 }
 
-/// A type that a key may have.
 pub(crate) trait Setting: Sized {
     /// Description of the type for fault messages, such as "a number".
     const KIND: &'static str;
     /// Description of a list of this type.
     const LIST_KIND: &'static str = "a list";
-    /// The allowed words, if the type is a choice.
     const CHOICES: &'static [&'static str] = &[];
-    /// Reads and checks a value.
     fn read(value: &Spanned<DeValue<'_>>, allowed: &ValueRange) -> Result<Self, ValueFault>;
-    /// Reads and checks a value that consists of tables with their own keys; `None` for all other types.
+    /// Reads and checks a value that consists of tables with their own keys. The outer `None` means that this type has
+    /// no tables; the inner `None` means that the value is faulty.
     fn read_tables(_: &TableReader<'_>, _: &Key, _: &Spanned<DeValue<'_>>) -> Option<Option<Self>> {
         None
     }
@@ -98,18 +94,16 @@ pub(crate) trait Setting: Sized {
 /// What happens if the file does not contain a key.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Presence {
-    /// The absence is a fault.
     Required,
-    /// The absence is allowed. The text describes the default, or the condition that requires the key.
+    /// The key may be absent. The text describes the default, or the condition that requires the key.
     Optional(&'static str),
     /// If the key is absent, this TOML text is read as its value.
     Default(&'static str),
 }
 
-/// One key.
+/// A declared key.
 #[derive(Debug)]
 pub(crate) struct Key {
-    /// Name of the key in the file.
     pub name: &'static str,
     /// Meaning of the key, as printed in the reference page.
     pub about: &'static str,
@@ -119,9 +113,7 @@ pub(crate) struct Key {
     pub kind: &'static str,
     /// Allowed words, if the key is a choice.
     pub choices: &'static [&'static str],
-    /// Allowed range of the value.
     pub allowed: ValueRange,
-    /// What happens if the key is absent.
     pub presence: Presence,
 }
 
@@ -131,7 +123,7 @@ impl Key {
         if self.choices.is_empty() { self.allowed.to_string() } else { self.choices.join(" or ") }
     }
 
-    /// The range as it appears in a fault. Bounds so wide that no sensible value exceeds them are left out.
+    /// The range for a fault message. [`WIDEST`] is left out, because no sensible value exceeds it.
     fn range_in_fault(&self) -> String {
         match self.choices {
             [_, _, _, ..] => format!("one of {}", self.choices.join(", ")),
@@ -146,7 +138,7 @@ impl Key {
         about.split_once(". ").map_or(about, |(first, _)| first).trim_end_matches('.')
     }
 
-    /// The allowed values with their type, as they appear in a fault.
+    /// The allowed values and their type, for a fault message.
     pub(crate) fn must_be(&self) -> String {
         let range = self.range_in_fault();
         if self.allowed == ValueRange::NotEmpty {
@@ -160,7 +152,7 @@ impl Key {
         }
     }
 
-    /// The allowed values, without the type, for a fault of a value that has the right type.
+    /// The allowed values without their type, for a fault message about a value that has the right type.
     fn must_be_in_range(&self) -> String {
         match self.range_in_fault() {
             range if range.is_empty() || self.allowed == ValueRange::NotEmpty => self.must_be(),
@@ -176,7 +168,6 @@ pub(crate) struct TableReader<'a> {
     pub broken: bool,
     /// The table; `None` = the file does not contain the table.
     pub table: Option<&'a DeTable<'a>>,
-    /// Place of the table in the file.
     pub place: TablePlace,
 }
 

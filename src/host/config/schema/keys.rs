@@ -1,8 +1,5 @@
 //! Declares every key of the configuration file once, with meaning, type, unit, range and default.
-//!
-//! A declaration determines how a key is read and checked. It also gives the text of the key in fault messages ("must
-//! be"), in the reference page (`docs/src/reference/keys.md`) and in the manual page. If a table `gives` the parameters
-//! of an algorithm, its declaration also builds these parameters. [`config`](super::super) explains how to add a key.
+//! [`config`](super::super) explains how to add a key.
 
 mod algorithms;
 mod choices;

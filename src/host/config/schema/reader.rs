@@ -1,5 +1,5 @@
-//! Reads the declared tables of a document. An unknown key is a fault. The fault suggests the known key with the most
-//! similar name, or lists all known keys if no name is similar.
+//! Reads the declared tables of a document. An unknown key is a fault. The fault message suggests the most similar
+//! known key, or lists all known keys if no name is similar.
 
 use std::collections::BTreeSet;
 
@@ -10,7 +10,6 @@ use super::key::TableReader;
 use super::section::{Section, SectionInfo};
 use crate::config::document::{Document, SourceLine};
 
-/// Reads the declared tables of one document.
 pub(crate) struct SchemaReader<'a> {
     document: &'a Document<'a>,
     /// Whether a part of the document is unreadable. If so, a key that was not found may still exist, so no key is
@@ -19,15 +18,15 @@ pub(crate) struct SchemaReader<'a> {
 }
 
 impl<'a> SchemaReader<'a> {
-    /// Creates a reader. Reports the unknown keys of the document, and values where a table must be.
+    /// Creates a reader. Reports the unknown keys of the document, and values that should be tables.
     pub(crate) fn new(document: &'a Document<'a>, known: &[SectionInfo]) -> Self {
         let mut walk = Self { document, broken: document.broken };
         walk.refuse_unknown("", "", document.root(), known);
         walk
     }
 
-    /// Reads a table that occurs once. If the file does not contain the table, the table's defaults apply and its
-    /// required keys are reported as missing.
+    /// Reads a table that occurs once. If the file does not contain the table, its keys have their defaults, and
+    /// missing required keys are reported.
     pub(crate) fn one<S: Section>(&self) -> Option<S> {
         if S::PATH.is_empty() {
             let root = self.document.root();
@@ -42,7 +41,6 @@ impl<'a> SchemaReader<'a> {
         }
     }
 
-    /// Reads a table that may be absent.
     pub(crate) fn optional<S: Section>(&self) -> Option<S> {
         self.document.find(S::PATH).and_then(|_| self.one())
     }
@@ -83,8 +81,8 @@ impl<'a> SchemaReader<'a> {
         S::read(&TableReader { document: self.document, broken: self.broken, table, place })
     }
 
-    /// Reports every key of `table` that `known` does not contain. `schema` is the table's path in the schema, `shown`
-    /// the path in faults (with the number of a repeated table).
+    /// Reports every key of `table` that `known` does not contain. `schema` is the table's path in the schema. `shown`
+    /// is its path in fault messages, which includes the number of a repeated table.
     fn refuse_unknown(&mut self, schema: &str, shown: &str, table: &'a DeTable<'a>, known: &[SectionInfo]) {
         let here = known.iter().find(|info| info.path == schema);
         if here.is_some_and(|info| info.keys.is_none()) {

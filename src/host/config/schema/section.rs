@@ -1,9 +1,8 @@
-//! Declares tables and keys. One line of [`section!`] determines the type of a key, how the key is read, its fault
-//! messages, and its text in the reference.
+//! Macros that declare the tables and keys of a file.
 //!
-//! [`section!`] declares a table of a file and, if the table `gives` a parameter struct, builds that struct from the
-//! keys. [`tables!`] lists the tables of a file. [`SchemaReader`] reads the declared tables from a document. It reports
-//! missing and unknown keys, and values of the wrong type or out of range.
+//! [`section!`] declares a table, with one line for each key. The line determines the key's type, how it is read, its
+//! fault messages, and its text in the reference page. [`tables!`] lists the tables of a file. [`SchemaReader`] reads
+//! these tables from a document.
 
 use toml::Spanned;
 use toml::de::DeValue;
@@ -14,51 +13,44 @@ use super::key::{Key, Setting, TableReader, ValueFault, ValueRange};
 pub(crate) trait Section: Sized {
     /// Dotted path; empty for the top of the file.
     const PATH: &'static str;
-    /// Purpose of the table.
     const ABOUT: &'static str;
-    /// The keys of the table.
     const KEYS: &'static [Key];
-    /// Reads the table. Returns `None` and reports a fault if a key is bad.
+    /// Reads the table. If a key is bad, reports a fault and returns `None`.
     fn read(table: &TableReader<'_>) -> Option<Self>;
 }
 
 /// A declared table, for the check of unknown keys and for the reference page.
 #[derive(Debug)]
 pub(crate) struct SectionInfo {
-    /// Dotted path.
     pub path: &'static str,
     /// Whether the table is written `[[path]]` and may be repeated.
     pub many: bool,
-    /// Purpose of the table.
     pub about: &'static str,
-    /// The keys of the table; `None` = any key is allowed, because the table contains notes for people.
+    /// The keys of the table; `None` = any key is allowed, because the program ignores the table.
     pub keys: Option<&'static [Key]>,
 }
 
 impl SectionInfo {
-    /// A table that appears once.
     pub(crate) const fn one<S: Section>() -> Self {
         Self { path: S::PATH, many: false, about: S::ABOUT, keys: Some(S::KEYS) }
     }
 
-    /// A table that may be absent.
     pub(crate) const fn optional<S: Section>() -> Self {
         Self::one::<S>()
     }
 
-    /// A repeatable table.
     pub(crate) const fn many<S: Section>() -> Self {
         Self { path: S::PATH, many: true, about: S::ABOUT, keys: Some(S::KEYS) }
     }
 
-    /// A table of notes for people who read the file; the program ignores the table.
+    /// A table of notes for people who read the file.
     pub(crate) const fn notes(path: &'static str, about: &'static str) -> Self {
         Self { path, many: false, about, keys: None }
     }
 }
 
-/// Declares a table of a file: its struct and keys, the function that reads the table and, after `gives`, the
-/// parameters that the table provides.
+/// Declares a table of a file. The macro generates the table's struct and the function that reads the table. If the
+/// table has a `gives` clause, the macro also generates a function that builds the named parameter struct.
 ///
 /// ```text
 /// section! {
@@ -66,7 +58,7 @@ impl SectionInfo {
 ///     Transition at "transition" gives TransitionConfig, |keys, pack_ah: f64| {
 ///         /// A key that sets the field of the same name.
 ///         min_duration_s: f64, "s", Between(0.0, 1e6), Default("10.0");
-///         /// A key from which a field is computed. With `=>` alone, the key sets no field.
+///         /// A key from which a field is computed. If nothing follows `=>`, the key sets no field.
 ///         dead_band_a: Option<f64>, "A", Between(0.0, 1e6), Optional("C/50") => dead_band_a: keys.dead_band_a.unwrap_or(pack_ah / 50.0);
 ///     } and {
 ///         a_field_without_a_key: 1.0,
@@ -105,7 +97,6 @@ macro_rules! section {
         }
 
         impl $name {
-            /// The parameters that these keys set.
             pub(crate) fn config(&self $(, $argument: $argument_type)*) -> $target $(<$borrow>)? {
                 let $keys = self;
                 $crate::config::schema::section!(
@@ -121,7 +112,6 @@ macro_rules! section {
         #[derive(Debug, Clone)]
         #[allow(dead_code, reason = "some keys are only for people, and the places of some tables are not used by later checks")]
         pub(crate) struct $name {
-            /// Place of the table in the file.
             pub place: $crate::config::document::TablePlace,
             $( $(#[doc = $doc])+ pub $key: $type, )*
         }
@@ -158,13 +148,13 @@ macro_rules! table_field {
 }
 pub(crate) use table_field;
 
-/// Lists the tables of a file in the order of the reference page. The macro generates the struct of these tables and
-/// the function that reads it.
+/// Lists the tables of a file in the order of the reference page. The macro generates a struct of these tables and the
+/// function that reads it.
 ///
-/// A table is `one`, `optional` or `many`. A table `one` is always read: if the file does not contain the table, its
-/// keys have their defaults, and missing required keys are reported. A table `optional` is read only if the file
-/// contains it. A table `many` is repeatable (`[[path]]`). `with` names further tables that a key of the table
-/// contains.
+/// Each table is `one`, `optional` or `many`. A table marked `one` is always read: if the file does not contain it, its
+/// keys have their defaults, and missing required keys are reported. A table marked `optional` is read only if the file
+/// contains it. A table marked `many` is repeatable (`[[path]]`). `with` names the type of a table that a key of the
+/// table contains.
 macro_rules! tables {
     ($(#[$about:meta])* $name:ident, $sections:ident { $($field:ident: $kind:ident $section:ident $(with $below:ident)?),+ $(,)? }) => {
         $(#[$about])*
@@ -172,7 +162,6 @@ macro_rules! tables {
         pub(crate) struct $name {
             /// The file, as the user named it.
             pub file: String,
-            /// The list to which faults are added.
             pub faults: $crate::config::document::Faults,
             /// Whether the file's syntax or a table is broken. If so, a table that was not found may still exist.
             pub broken: bool,
@@ -182,7 +171,7 @@ macro_rules! tables {
         }
 
         impl $name {
-            /// Reads every table. Faulty and unknown keys are reported.
+            /// Reads every table, and reports faulty and unknown keys.
             pub(crate) fn read(document: &$crate::config::document::Document<'_>) -> Self {
                 use $crate::config::schema::Section as _;
                 let reader = $crate::config::schema::SchemaReader::new(document, $sections);
@@ -200,7 +189,6 @@ macro_rules! tables {
                 self.count::<S>() > 0
             }
 
-            /// How often the file contains a table, including faulty tables.
             pub(crate) fn count<S: $crate::config::schema::Section>(&self) -> usize {
                 self.written.get(S::PATH).copied().unwrap_or_default()
             }
@@ -211,7 +199,6 @@ macro_rules! tables {
             }
         }
 
-        /// Every table, in the order of the reference page.
         pub(crate) const $sections: &[$crate::config::schema::SectionInfo] =
             &[$( $crate::config::schema::SectionInfo::$kind::<$section>(), $( $crate::config::schema::SectionInfo::many::<$below>(), )? )+];
     };

@@ -7,7 +7,7 @@ use toml::de::{DeInteger, DeValue};
 
 use super::key::{Setting, ValueFault, ValueRange, in_range, typed};
 
-/// Maximum count of numbers in a [`NumberRange`]. No pack has more cells.
+/// Maximum length of a [`NumberRange`]. No pack has more cells.
 const MAX_ROW: usize = 2048;
 
 impl<T: Setting> Setting for Option<T> {
@@ -44,8 +44,7 @@ impl Setting for f64 {
     }
 }
 
-/// Returns the value of an integer that is written in any of TOML's bases; `None` if the value does not fit into an
-/// `i128`.
+/// Parses a TOML integer of any base. Returns `None` if the value does not fit into an `i128`.
 fn whole(integer: &DeInteger<'_>) -> Option<i128> {
     i128::from_str_radix(integer.as_str(), integer.radix()).ok()
 }
@@ -129,8 +128,8 @@ impl Setting for NumberRange {
     }
 }
 
-/// Makes an enum the type of a key, and declares the allowed words with the value that each word stands for. A second
-/// word is a short form.
+/// Implements `Setting` for an enum. Each line maps an allowed word to a value. A second word is a short form of the
+/// first.
 macro_rules! choice {
     ($type:ty { $($word:literal $(| $short:literal)? => $value:expr),+ $(,)? }) => {
         impl $crate::config::schema::Setting for $type {

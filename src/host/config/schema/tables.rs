@@ -64,7 +64,7 @@ impl RawTables {
         !self.broken && self.interfaces.len() == self.count::<Interface>()
     }
 
-    /// Reports `text` at the table `place`, or at line 1 of the file if the table could not be read.
+    /// Reports `text` at the table `place`, or at line 1 of the file if `place` is `None`.
     pub(crate) fn note(&self, place: Option<&TablePlace>, text: &str) {
         match place {
             Some(place) => self.faults.add_at(&place.at, text),
@@ -83,13 +83,12 @@ impl RawTables {
         self.is_written::<PackVoltageInput>()
     }
 
-    /// Whether `[output]` is written with `enabled = false`.
     pub(crate) fn is_output_disabled(&self) -> bool {
         self.output.as_ref().is_some_and(|output| !output.enabled)
     }
 
-    /// The interface with this name, or the first interface if no name is given. `None` = there is no such interface
-    /// (another check reports this fault).
+    /// The interface with this name, or the first interface if no name is given. If there is no such interface, returns
+    /// `None`; another check reports this fault.
     pub(crate) fn bus_of(&self, interface: Option<&str>) -> Option<BusIndex> {
         let index = match interface {
             Some(name) => self.interfaces.iter().position(|interface| interface.name == name)?,
@@ -98,9 +97,9 @@ impl RawTables {
         u8::try_from(index).ok().map(BusIndex)
     }
 
-    /// Returns the interface of a table that uses exactly one interface. Returns `None` and reports a fault if the name
-    /// is unknown, or if no name is given although there are several interfaces. If an `[[interface]]` is faulty or
-    /// all are missing, only that fault is reported.
+    /// Returns the interface of a table that uses exactly one interface. If the name is unknown, or if no name is given
+    /// although there are several interfaces, reports a fault and returns `None`. This fault is not reported if an
+    /// `[[interface]]` is faulty or if there is no interface, because another check reports that.
     pub(crate) fn one_bus(&self, interface: Option<&str>, place: &TablePlace) -> Option<BusIndex> {
         let is_clear = interface.is_some() || self.distinct_interfaces().len() <= 1;
         let bus = self.bus_of(interface).filter(|_| is_clear);
@@ -115,7 +114,7 @@ impl RawTables {
         self.distinct_interfaces().join(" or ")
     }
 
-    /// Names of the interfaces, each once. Another check reports a name that is given twice.
+    /// Names of the interfaces, each once. Another check reports duplicate names.
     fn distinct_interfaces(&self) -> Vec<&str> {
         let mut names: Vec<&str> = Vec::new();
         for interface in &self.interfaces {
@@ -134,7 +133,6 @@ impl RawTables {
         }
     }
 
-    /// The configured signal of a channel.
     pub(crate) fn source(&self, channel: Channel) -> Option<SignalSource<'_>> {
         match channel {
             Channel::Current => self.current.as_ref().map(|keys| keys.config()),

@@ -9,7 +9,6 @@ use crate::alarm::Comparison;
 /// A threshold value: absolute, or relative to a new cell.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Level {
-    /// A value in the rule's unit.
     Absolute(f64),
     /// A fraction of a new cell's value, from a string like "80 %".
     Relative(f64),

@@ -42,7 +42,6 @@ fn faulty_message_of_output_dbc_is_fault() {
     assert!(faults.iter().any(|fault| fault.contains("twin.dbc:") && fault.contains("Bad is left out")), "{faults:?}");
 }
 
-/// The DBC with extended identifiers, and the given frame format for all messages.
 fn j1939(format: &str) -> String {
     let dbc = DBC.replace("BO_ 256 ", "BO_ 2566869246 ").replace("BO_ 272 ", "BO_ 2566869502 ");
     let dbc = dbc.replace("VAL_ 256 ", "VAL_ 2566869246 ");
@@ -95,7 +94,6 @@ fn messages_of_one_group_keep_their_source_address() {
     assert_eq!(configured(&config, 0x18FF_51F4), 0x18FF_51FE);
 }
 
-/// The DBC with a magnitude and a direction.
 fn magnitude() -> String {
     let signed = " SG_ Current : 0|16@1- (0.1,0) [-300|500] \"A\" A\n";
     let parts = " SG_ Current : 0|15@1+ (0.1,0) [0|500] \"A\" A\n SG_ Charging : 15|1@1+ (1,0) [0|1] \"\" A\n";

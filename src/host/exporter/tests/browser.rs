@@ -1,4 +1,4 @@
-//! The page in headless Chromium, with a fake daemon.
+//! Tests the page in headless Chromium, with a fake daemon.
 
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 
@@ -9,7 +9,6 @@ use crate::io::socket::LinkState;
 use crate::monitor::Validity;
 use crate::quantity::catalogue::{PackValues, Quantity};
 
-/// A page in a browser.
 struct Browser {
     process: Child,
     questions: Option<ChildStdin>,
@@ -44,7 +43,6 @@ impl Browser {
         serde_json::from_str(&line).unwrap_or_else(|error| panic!("{line:?}: {error}"))
     }
 
-    /// Waits until the headline is `wanted`.
     fn wait_for_headline(&mut self, wanted: &str) {
         let end = Instant::now() + Duration::from_secs(20);
         loop {
@@ -57,13 +55,12 @@ impl Browser {
         }
     }
 
-    /// The texts of the elements that match a selector.
     fn texts(&mut self, selector: &str) -> Vec<String> {
         let texts = self.ask(&format!("[...document.querySelectorAll('{selector}')].map(it=>it.textContent)"));
         serde_json::from_value(texts).unwrap()
     }
 
-    /// Closes the page. Returns its requests, its messages and its excess width.
+    /// Closes the page. Returns the page's requests, its messages and the overflow of its width (px).
     fn close(mut self) -> Value {
         self.questions = None;
         let report = self.answer();
@@ -152,7 +149,7 @@ fn page_shows_what_the_document_says() {
     assert_eq!(browser.texts("img").len(), 0, "names are text");
     assert!(browser.ask(labels)[0].as_str().unwrap().ends_with("alarm or finding"));
 
-    // Damage in the page's own state: a document that it cannot read, a clock that was set back, a late document.
+    // Damages the page's own state: a document that it cannot read, a clock that was set back, a late document.
     daemon.report(healthy());
     browser.wait_for_headline(HEALTHY);
     let mut head =
@@ -200,7 +197,7 @@ fn page_fits_phone_and_many_cells() {
     };
     browser.wait_for_headline("Severe alarm: capacity low, cell 1: 2.412 Ah, limit 2.500 Ah");
     assert_eq!(browser.texts("#map div").len(), 1024);
-    // The time on a processor does not depend on other programs.
+    // CPU time does not depend on the load by other programs.
     let spent_ms = || {
         let statistics = std::fs::read_to_string(thread.join("schedstat")).unwrap();
         statistics.split(' ').next().unwrap().parse::<f64>().unwrap() / 1e6

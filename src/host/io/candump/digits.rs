@@ -1,12 +1,12 @@
 //! Converts the digits of a candump line several bytes at a time. Some functions treat a `u64` as eight lanes of one
 //! byte each, with the first byte of the text in the lowest lane. Others use loops that compile to vector instructions.
 
-/// A word with 1 in every byte. `HIGHS` has the highest bit of every byte.
+/// A word with 1 in every byte. `HIGHS` has only the highest bit of every byte set.
 const ONES: u64 = 0x0101_0101_0101_0101;
 const HIGHS: u64 = 0x80 * ONES;
 
-/// Value of each hex digit. The value of any other character is so large that an identifier computed from it is out of
-/// range.
+/// Value of each hex digit. For any other character, the value is so large that an identifier computed from it is out
+/// of range.
 pub(super) static HEX: [u32; 256] = {
     let mut table = [u16::MAX as u32; 256];
     let mut digit = 0;
@@ -37,8 +37,8 @@ pub(super) fn eight_digits(text: u64) -> Option<i64> {
     lanes(text ^ (u64::from(b'0') * ONES), 0x76 * ONES).map(number::<1>)
 }
 
-/// Returns `lanes` unchanged if all lanes are valid; `None` = a lane is 0x80 or more, either before or after `wrong` is
-/// added. The caller chooses `wrong` so that adding it raises every lane above the largest valid value to 0x80 or more.
+/// Returns `lanes` if all lanes are valid, otherwise `None`. A lane is invalid if it is 0x80 or more, before or after
+/// `wrong` is added. The caller chooses `wrong` so that lanes above the largest valid value become 0x80 or more.
 #[inline(always)]
 fn lanes(lanes: u64, wrong: u64) -> Option<u64> {
     ((lanes | lanes.wrapping_add(wrong)) & HIGHS == 0).then_some(lanes)

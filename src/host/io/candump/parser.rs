@@ -12,10 +12,9 @@ use crate::quantity::{BusIndex, Timestamp};
 
 /// Largest 29-bit identifier, and the mask of an error frame's class bits.
 const MAX_EXTENDED: u32 = 0x1FFF_FFFF;
-/// Two words that match no line: the words of a line overlap, but the overlapping bytes of these words differ.
+/// Initial value of `head`. It matches no line, because the overlapping bytes of its two words differ.
 const NO_HEAD: [u64; 2] = [0, u64::MAX];
 
-/// An interface with a name of up to seven bytes.
 #[derive(Debug, Clone, Copy)]
 struct Interface {
     /// The name and the space after it, as a word. Different names have different words.
@@ -70,10 +69,9 @@ pub struct ParsedLine<'a> {
 pub(crate) struct LineHead<'a> {
     pub time: Timestamp,
     pub interface: &'a [u8],
-    /// Number of the interface if the parser knows its name. The number is `None` if the name has more than seven
-    /// bytes, and may be `None` if the name follows more than one space.
+    /// Number of the interface. `None` if the parser does not know the name, or if the name has more than seven
+    /// bytes. May also be `None` if more than one space precedes the name.
     pub bus: Option<BusIndex>,
-    /// The rest of the line.
     pub rest: Cursor<'a>,
 }
 
@@ -111,7 +109,6 @@ impl LineParser {
         Ok(ParsedLine { line, len })
     }
 
-    /// Parses the stamp and the interface's name at the start of `text`.
     #[inline(always)]
     pub(crate) fn parse_head<'a>(&mut self, text: &'a [u8]) -> Result<LineHead<'a>, LineError> {
         let mut rest = Cursor { text, at: 0 };
@@ -120,7 +117,6 @@ impl LineParser {
         Ok(LineHead { time, interface, bus, rest })
     }
 
-    /// Parses the stamp and the space after it.
     #[inline(always)]
     fn stamp(&mut self, cursor: &mut Cursor<'_>) -> Result<Timestamp, LineError> {
         if let Some(text) = cursor.text.first_chunk::<24>()
@@ -135,7 +131,6 @@ impl LineParser {
         Ok(time)
     }
 
-    /// Parses a stamp of any form and the space after it. Also returns the position after the space.
     #[inline(never)]
     fn other_stamp(&mut self, mut cursor: Cursor<'_>) -> Result<(Timestamp, usize), LineError> {
         let time = cursor.stamp()?;
@@ -149,12 +144,11 @@ impl LineParser {
         Ok((time, cursor.at))
     }
 
-    /// Parses the interface's name and the space after it. Returns the name, and its number if known.
     #[inline(always)]
     fn interface<'a>(&self, cursor: &mut Cursor<'a>) -> Result<(&'a [u8], Option<BusIndex>), LineError> {
-        // The position after the name depends on the name's length. When the name is compared with known names, the
-        // processor can predict this position. If the bytes were counted instead, the processor would have to wait for
-        // the count.
+        // The position after the name depends on the name's length. If the name is compared with known names, the
+        // processor can predict this position. If the bytes were counted, the processor would have to wait for the
+        // count.
         let ahead = cursor.ahead().unwrap_or(&[0; 8]);
         let name = u64::from_le_bytes(*ahead);
         let is_known = |known: &&Interface| name & known.mask == known.name;
@@ -192,7 +186,7 @@ fn drop_count(line: &[u8]) -> Option<Line<'_>> {
     Some(Line::Dropped { interface, frames })
 }
 
-/// A position in a line. Functions for rare forms take the cursor by value, so that the cursor stays in registers.
+/// A position in a line. Functions for rare forms take a copy of the cursor, so that the original stays in registers.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Cursor<'a> {
     pub(super) text: &'a [u8],
@@ -212,12 +206,10 @@ impl<'a> Cursor<'a> {
         if self.take(byte) { Ok(()) } else { self.fail(expected) }
     }
 
-    /// The next byte of the line.
     fn peek(&self) -> Option<u8> {
         self.text.get(self.at).copied().filter(|&byte| byte != b'\n')
     }
 
-    /// The next bytes of the text.
     #[inline(always)]
     fn ahead<const N: usize>(&self) -> Option<&'a [u8; N]> {
         self.text.get(self.at..)?.first_chunk()
@@ -274,7 +266,6 @@ impl<'a> Cursor<'a> {
         Ok(())
     }
 
-    /// Parses any interface name with the spaces around it. Also returns the position after the spaces.
     #[inline(never)]
     pub(super) fn interface(mut self) -> Result<(&'a [u8], usize), LineError> {
         while self.take(b' ') {}
@@ -309,7 +300,6 @@ impl<'a> Cursor<'a> {
         Ok((body, transmitted, self.at))
     }
 
-    /// Parses a frame and the spaces before it.
     pub(super) fn frame(&mut self) -> Result<Body, LineError> {
         while self.take(b' ') {}
         let is_delimited = |digits: usize| self.text.get(self.at + digits) == Some(&b'#');
@@ -337,7 +327,7 @@ impl<'a> Cursor<'a> {
         if let Some(id) = CanId::extended(raw) {
             return self.payload(id).map(Body::Frame);
         }
-        // This bit marks an error frame.
+        // Bit 0x20000000 marks an error frame.
         if raw & !MAX_EXTENDED != 0x2000_0000 {
             self.at -= 9;
             return self.fail("an identifier of at most 1FFFFFFF, or an error frame's (bit 20000000)");
@@ -347,7 +337,6 @@ impl<'a> Cursor<'a> {
         Ok(Body::Error(class))
     }
 
-    /// Parses `N` hex digits.
     fn number<const N: usize>(&mut self) -> Result<u32, LineError> {
         let mut value = 0;
         for _ in 0..N {
@@ -387,8 +376,8 @@ impl<'a> Cursor<'a> {
         self.expect(Frame::remote(id, len), "a length of 0 to 8")
     }
 
-    /// Parses `_9` to `_F` after a length of 8: the length code (DLC) on the wire. The payload has 8 bytes for all
-    /// these codes.
+    /// Parses `_9` to `_F`, which may follow a length of 8. They state the length code (DLC) on the wire. The payload
+    /// still has 8 bytes.
     fn raw_length_code(&mut self, len: usize) -> Result<(), LineError> {
         if len != 8 || !self.take(b'_') {
             return Ok(());

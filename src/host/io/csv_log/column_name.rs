@@ -1,11 +1,10 @@
-//! Takes the name of a column apart: words, unit and number.
+//! Splits the name of a column into words, unit and number.
 //!
 //! In: a name such as `Current(mA)`, `Test Time / s`, `<I>/mA`, `Aux_Temperature(C)_1`, `voltage12_v` or `Cell 3 [mV]`.
 //! Out: the words in lower case without unit and number, the unit, and the number.
 
 use crate::io::units::{Unit, is_clock};
 
-/// The parts of a column's name.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct ColumnName {
     /// Words in lower case, separated by blanks, without unit and number.
@@ -19,7 +18,7 @@ pub(super) struct ColumnName {
 }
 
 impl ColumnName {
-    /// Takes a name apart. `unit` is the text of the column in a line of units; empty = no such line.
+    /// Splits a name. `unit` is the text of the column in a line of units; empty = no such line.
     pub(super) fn parse(name: &str, unit: &str) -> Self {
         let name = name.trim().trim_start_matches(['#', '~', ' ']);
         let (rest, stated) = split_unit(name);
@@ -84,7 +83,7 @@ fn words_and_number(text: &str) -> (String, Option<u16>) {
         Err(_) => true,
     });
     let number = if let [number] = numbers[..] { Some(number) } else { None };
-    // A name with several numbers belongs to no cell; the numbers stay part of the name.
+    // A name with several numbers does not belong to one cell. Its numbers stay part of the name.
     if numbers.len() > 1 {
         parts.extend(numbers.iter().map(u16::to_string));
     }

@@ -1,7 +1,7 @@
 //! The names of columns in the exports of cyclers, applications and battery management systems.
 //!
-//! In: the names of a header. Out: the [`Role`] of each known column, and the [`Format`] that writes such a header.
-//! Source: the column names in public projects that read these exports.
+//! In: the names of a header. Out: the [`Role`] of each known column, and the [`Format`], that is, the program that
+//! writes such a header. Source: the column names in public projects that read these exports.
 
 use super::column_name::ColumnName;
 use crate::io::units::{Quantity, Unit};
@@ -17,7 +17,6 @@ pub const BDF_COLUMNS: [(&str, &str, &str); 6] = [
     ("discharged_ah", "Net Capacity / Ah", "net_capacity_ah"),
 ];
 
-/// What a column holds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Role {
     /// Time since the beginning of the file, or since 1970.
@@ -41,8 +40,8 @@ pub(super) enum Role {
     Soc,
 }
 
-/// Names of each role, divided by bars. Earlier lines are preferred to later ones; a column of a later line is used only if the file has
-/// no column of an earlier line.
+/// Names of each role, divided by bars. A column of a later line is used only if the file has no column of an earlier
+/// line.
 const NAMES: [(Role, &str); 19] = [
     (Role::Time, "test time|total time|testtime|totaltime|prog time|program time|program duration|test"),
     (
@@ -109,7 +108,6 @@ const NAMES: [(Role, &str); 19] = [
     (Role::StepTime, "\u{65f6}\u{95f4}"),
 ];
 
-/// Words for the battery.
 const BATTERY: [&str; 4] = ["battery", "batt", "bat", "pack"];
 
 /// Names that contain their unit as a word.
@@ -128,7 +126,6 @@ const UNITS_AS_NAMES: [(&str, &str); 12] = [
     ("mamps", "mA"),
 ];
 
-/// A known column.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Known {
     pub(super) role: Role,
@@ -154,7 +151,6 @@ impl Role {
     }
 }
 
-/// The roles that a column may have.
 pub(super) fn known(name: &str, unit: &str) -> Vec<Known> {
     if !unit.is_empty() && unknown_unit(name, unit).is_some() {
         return Vec::new();
@@ -193,7 +189,7 @@ fn lookup(name: &ColumnName) -> Vec<Known> {
         };
         let number_fits = match role {
             Role::CellVoltage => name.number.is_some(),
-            // Only the unit says what of the battery is meant.
+            // Only the unit shows whether a current or a voltage is meant.
             Role::Current | Role::Voltage if BATTERY.contains(&name.words.as_str()) => {
                 name.number.is_none() && unit.is_some()
             }
@@ -210,8 +206,8 @@ fn lookup(name: &ColumnName) -> Vec<Known> {
     named.map(|(rank, &(role, _))| Known { role, rank, unit, number: name.number }).collect()
 }
 
-/// Rates the fields of a line that may be a header: the number of known columns if a time and a current or voltage are
-/// among them, else 0.
+/// Rates the fields of a line that may be a header. Returns the number of known columns if a time and a current or
+/// voltage are among them, else 0.
 pub(super) fn score(fields: &[String]) -> usize {
     let roles: Vec<Role> =
         fields.iter().flat_map(|field| known(field, "").into_iter().map(|of| of.role).take(1)).collect();
@@ -239,7 +235,6 @@ pub(super) enum Format {
 }
 
 impl Format {
-    /// Finds the format from the names of the columns.
     pub(super) fn of(names: &[String]) -> Self {
         let lower: Vec<String> = names.iter().map(|name| name.trim().to_lowercase()).collect();
         let has = |wanted: &str| lower.iter().any(|name| name == wanted);
@@ -285,7 +280,6 @@ impl Format {
         }
     }
 
-    /// Name for messages.
     pub(super) const fn name(self) -> Option<&'static str> {
         Some(match self {
             Self::Packwatch | Self::Unknown => return None,
@@ -306,8 +300,8 @@ impl Format {
     pub(super) const fn charge_positive(self) -> Option<bool> {
         match self {
             Self::Packwatch | Self::PyBamm => Some(false),
-            // The Battery Data Format does not state the sign, but its net capacity is charged minus discharged
-            // capacity, and cyclers use this sign.
+            // The Battery Data Format does not state the sign. However, its net capacity is charged minus discharged
+            // capacity, and cyclers count a charging current as positive.
             Self::Bdf | Self::Arbin | Self::Neware | Self::BioLogic | Self::Digatron | Self::Basytec | Self::Cellpy => {
                 Some(true)
             }
@@ -315,7 +309,7 @@ impl Format {
         }
     }
 
-    /// Unit of the cells' voltages if the header states none.
+    /// Unit of the cell voltages if the header does not state it.
     pub(super) fn cell_voltage_unit(self) -> Option<&'static Unit> {
         (self == Self::LeafSpy).then(|| Unit::find("mV")).flatten()
     }

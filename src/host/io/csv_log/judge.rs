@@ -1,5 +1,5 @@
-//! Judges the first rows of a table: units that the header does not state, the sign of the current, and whether the
-//! values can be what the header says.
+//! Judges the first rows of a table. Finds the units that the header does not state and the sign of the current, and
+//! checks that the values are possible in the stated units.
 //!
 //! In: the first rows (at most a megabyte), the layout and the options. Out: a [`Judgement`], or an error that names
 //! the column, what was found and the probable unit.
@@ -14,28 +14,24 @@ use crate::io::plausible::{self, Implausible, PackSize, ShownSign, median};
 use crate::io::table::{FirstRows, Header, Row, TableError};
 use crate::io::units::Unit;
 
-/// The result.
 #[derive(Debug)]
 pub(super) struct Judgement {
     pub(super) time: TimeText,
     pub(super) time_form: TimeForm,
     /// Whether the unit of time is a guess.
     pub(super) is_time_assumed: bool,
-    /// Whether the first time is after the times that follow, which are in order.
+    /// Whether the first time is after the following times, which are in order.
     pub(super) is_first_time_late: bool,
     pub(super) sign: CurrentSign,
-    /// Remarks for the user.
     pub(super) notes: Vec<String>,
 }
 
-/// Values of the first rows.
 #[derive(Debug, Default)]
 struct Samples {
     time_texts: Vec<String>,
     /// Times as numbers in the unit of the file; only for times without colons.
     raw_times: Vec<f64>,
     currents: Vec<f64>,
-    /// Voltage of a cell.
     voltages: Vec<f64>,
     temperatures: Vec<Vec<f64>>,
     states: Vec<Vec<u8>>,
@@ -84,7 +80,6 @@ impl Samples {
     }
 }
 
-/// Judges the first rows, and completes the units of `layout`.
 pub(super) fn judge(first: &FirstRows, layout: &mut Layout, options: &CsvOptions) -> Result<Judgement, TableError> {
     let mut samples = Samples::read(first, layout);
     if options.pack_total {
@@ -93,7 +88,7 @@ pub(super) fn judge(first: &FirstRows, layout: &mut Layout, options: &CsvOptions
     Judge { header: &first.header, options, samples, notes: std::mem::take(&mut layout.notes) }.run(layout)
 }
 
-/// Largest number of states as numbers.
+/// Maximum number of different states that are numbers.
 const MAX_CODES: usize = 8;
 
 struct Judge<'a> {
@@ -150,7 +145,7 @@ impl Judge<'_> {
         };
         let symbol = column.map_or("", |column| column.unit.symbol);
         let is_too_small = of.quantity == "voltage" && of.probable.is_none() && symbol == "mV";
-        // The unit that the values already have helps no one.
+        // Do not propose the unit that the values already have.
         let probable = if is_too_small { Some("V") } else { of.probable.filter(|&unit| unit != symbol) };
         let hint = probable.map_or_else(
             || format!("; name the right column with --column {role}=NAME"),
@@ -181,7 +176,7 @@ impl Judge<'_> {
         let size = PackSize { capacity_ah: self.options.capacity_ah };
         let checked = plausible::check_currents(&self.samples.currents, size);
         let Err(of) = checked else {
-            // Single impossible currents are refused row by row.
+            // Single impossible currents are rejected row by row.
             let impossible = self.samples.currents.iter_mut().filter(|i| i.abs() > size.max_current_a());
             impossible.for_each(|i| *i = f64::NAN);
             return Ok(());
@@ -198,7 +193,7 @@ impl Judge<'_> {
         Ok(())
     }
 
-    /// Finds kelvin, and leaves out columns of impossible temperatures.
+    /// Finds temperatures in kelvin, and leaves out columns with impossible temperatures.
     fn temperature_units(&mut self, layout: &mut Layout) {
         let mut medians = self.samples.temperatures.iter().map(|values| median(values));
         layout.channels.retain_mut(|(channel, column)| {
@@ -224,7 +219,7 @@ impl Judge<'_> {
         });
     }
 
-    /// Finds the unit of a reported SOC; a column that fits none is left out.
+    /// Finds the unit of a reported SOC. If no unit fits, leaves out the column.
     fn soc_unit(&mut self, layout: &mut Layout) {
         let largest = self.samples.socs.iter().copied().filter(|soc| soc.is_finite()).fold(0.0, f64::max);
         let unit = match largest {
@@ -244,7 +239,7 @@ impl Judge<'_> {
         }
     }
 
-    /// Finds form and unit of the times. Returns the times of the rows (s), too.
+    /// Finds the form and unit of the times. Also returns the times of the rows (s).
     fn times(&mut self, layout: &Layout) -> Result<(TimeText, TimeForm, bool, Vec<f64>), TableError> {
         let texts = &self.samples.time_texts;
         let first = texts.iter().find(|text| text.contains(|c: char| c.is_ascii_digit()));
@@ -261,7 +256,7 @@ impl Judge<'_> {
         let times: Vec<f64> =
             texts.map(|text| trial.parse(text.as_bytes()).map_or(f64::NAN, |time| time.secs())).collect();
         if form == TimeForm::Number {
-            // Times out of range were not read, so the numbers themselves are checked.
+            // Times out of range are not parsed, so check the numbers themselves.
             let raw: Vec<f64> = self.samples.raw_times.iter().map(|&time| unit.convert(time)).collect();
             plausible::check_dates(&raw).map_err(|of| self.fault(layout, &of))?;
         }
@@ -274,7 +269,8 @@ impl Judge<'_> {
         Ok((reader, form, is_assumed, times))
     }
 
-    /// Whether the dates of the table begin with the day. If no date decides, the month is first.
+    /// Whether the dates of the table begin with the day. If the dates do not decide, the order with the shorter
+    /// record is assumed.
     fn is_day_first(&mut self, form: TimeForm) -> bool {
         if form != TimeForm::Date {
             return false;
@@ -287,7 +283,7 @@ impl Judge<'_> {
         is_day_first
     }
 
-    /// The unit of times as numbers without a unit, and whether it is a guess.
+    /// The unit of times that are numbers without a unit, and whether this unit is a guess.
     fn unstated_time_unit(&self, layout: &Layout) -> (&'static Unit, bool) {
         let raw = &self.samples.raw_times;
         let find = |symbol: &str| Unit::find(symbol).unwrap_or(layout.time.unit);
@@ -305,7 +301,8 @@ impl Judge<'_> {
         distinct.dedup();
         let step = plausible::median_step(&distinct).unwrap_or_default();
         let days = find("Excel days");
-        // From 1970 to 2100, with rows at most some minutes apart; as seconds, they would be less than 4 ms apart.
+        // Excel days from 1970 to 2100, with rows at most some minutes apart. As seconds, the rows would be less than
+        // 4 ms apart.
         if (25_569.0..73_051.0).contains(&middle) && step > 0.0 && step < 0.004 && self.is_possible_time_unit(raw, days)
         {
             return (days, true);
@@ -316,7 +313,7 @@ impl Judge<'_> {
         if let Some(symbol) = by_charge {
             return (find(symbol), false);
         }
-        // Rows are rarely ten minutes or less than 5 ms apart.
+        // Rows are rarely more than ten minutes or less than 5 ms apart.
         let usual = if step >= 500.0 { ["ms", "us", "ns", "s"] } else { ["s", "ms", "min", "h"] };
         let is_usual = |symbol: &&str| find(symbol).convert(step) >= 0.005 || step <= 0.0;
         let mut candidates = grid_unit(raw).into_iter().chain(usual.into_iter().filter(is_usual)).chain(["s"]);
@@ -324,7 +321,7 @@ impl Judge<'_> {
         (unit.map_or(layout.time.unit, find), true)
     }
 
-    /// Whether currents and voltages allow that the times are in `unit`.
+    /// Whether currents and voltages are plausible if the times are in `unit`.
     fn is_possible_time_unit(&self, raw: &[f64], unit: &Unit) -> bool {
         let Some(capacity_ah) = self.options.capacity_ah else { return true };
         let times: Vec<f64> = raw.iter().map(|&time| unit.convert(time)).collect();
@@ -333,13 +330,14 @@ impl Judge<'_> {
             && plausible::check_slope(&times, currents, voltages, capacity_ah).is_ok()
     }
 
-    /// The charge of the currents over the charge that a column of the table states, if the times are in `unit`. Gaps
-    /// and small currents, which may be an offset, do not count, nor do rows in which the column begins anew.
+    /// The charge computed from the currents, divided by the charge that a column of the table states, if the times
+    /// are in `unit`. Three kinds of rows do not count: gaps, small currents (which may be an offset), and rows in
+    /// which the column restarts.
     fn charge_ratio(&self, raw_times: &[f64], unit: &Unit) -> Option<f64> {
         let Samples { currents, discharged, .. } = &self.samples;
         let longest = plausible::longest_step(raw_times);
         let smallest = 0.05 * currents.iter().copied().filter(|i| i.is_finite()).fold(0.0, |max, i| i.abs().max(max));
-        // Charge of the currents and of the column, for each direction of a positive current.
+        // Charge of the currents and of the column, for each possible sign of the current.
         let mut sums = [(0.0, 0.0); 2];
         for (n, step) in raw_times.windows(2).enumerate().map(|(n, pair)| (n, pair[1] - pair[0])) {
             let (current, change) = (currents[n], discharged[n + 1] - discharged[n]);
@@ -354,7 +352,8 @@ impl Judge<'_> {
         (charge > 0.0 && stated > 0.0).then(|| charge / stated)
     }
 
-    /// The unit closest to `unit`, longer or shorter, that the table allows with rows at least 20 ms apart.
+    /// The unit closest to `unit`, longer or shorter, that is possible for this table and gives rows at least 20 ms
+    /// apart.
     fn other_time_unit(&self, unit: &Unit, is_longer: bool) -> Option<&'static str> {
         let raw = &self.samples.raw_times;
         let step = plausible::median_step(raw).unwrap_or_default();
@@ -369,7 +368,8 @@ impl Judge<'_> {
         if is_longer { units.into_iter().find(is_possible) } else { units.into_iter().rev().find(is_possible) }
     }
 
-    /// Notes times that advance as those of a longer unit than the stated one do, or are too short for the voltages.
+    /// Adds a note if the times are probably in another unit than the stated unit. For example, the times advance
+    /// like those of a longer unit, or they are too short for the voltages.
     fn note_other_unit(&mut self, layout: &Layout, stated: &Unit, times: &[f64]) {
         let Samples { currents, voltages, .. } = &self.samples;
         let slope = self.options.capacity_ah.and_then(|ah| plausible::check_slope(times, currents, voltages, ah).err());
@@ -413,7 +413,7 @@ impl Judge<'_> {
         Err(self.fault(layout, &Implausible { quantity, what, probable: Some(unit) }))
     }
 
-    /// Keeps a section column that no one named only if the time restarts at its new values.
+    /// Drops a section column that the user did not name, unless the time restarts where its value changes.
     fn keep_section(&self, layout: &mut Layout, times: &[f64]) {
         if layout.is_section_named || layout.format == Format::Packwatch || layout.is_step_time {
             return;
@@ -426,7 +426,7 @@ impl Judge<'_> {
         }
     }
 
-    /// The directions of states that are numbers, if the voltage shows a charge and a discharge with them.
+    /// The directions of states that are numbers. Empty unless the voltage shows both a charge and a discharge.
     fn codes(&self, layout: &Layout, times: &[f64]) -> Vec<(Vec<u8>, Direction)> {
         let Samples { states, currents, voltages, .. } = &self.samples;
         let mut codes: Vec<Vec<u8>> = states.iter().filter(|state| is_code(state)).cloned().collect();
@@ -464,7 +464,8 @@ impl Judge<'_> {
             .count()
         };
         let [discharges, charges] = [Direction::Discharge, Direction::Charge].map(|direction| count(direction, true));
-        // With charges and discharges of a positive current, single negative currents are faults of a magnitude.
+        // If a positive current occurs in charges and in discharges, the current is a magnitude. Single negative
+        // currents are then faults.
         let is_magnitude = negative < charges.min(discharges) && 100 * negative <= samples.currents.len();
         let is_never_negative = negative == 0 || is_magnitude;
         let codes = if is_never_negative { self.codes(layout, times) } else { Vec::new() };
@@ -534,8 +535,8 @@ fn is_voltage(channel: Channel) -> bool {
     matches!(channel, Channel::PackVoltage | Channel::CellVoltage(_))
 }
 
-/// The unit in which times advance by whole seconds, if they are no decimal numbers of seconds: rows every 1/60 are
-/// minutes. Times with more than three decimals or uneven steps are not decimal.
+/// The unit (min or h) in which the times are whole seconds, such as rows at every 1/60 min. `None` if the times are
+/// decimal seconds, that is, have even steps with at most four decimals.
 fn grid_unit(times: &[f64]) -> Option<&'static str> {
     let step = plausible::median_step(times).filter(|step| (0.0..0.9).contains(step) && *step > 0.0)?;
     let known: Vec<f64> = times.iter().copied().filter(|time| time.is_finite()).collect();

@@ -1,8 +1,8 @@
 //! Chooses the columns of a table of samples.
 //!
-//! In: the header and the options. Out: a [`Layout`]: for each role the column and its unit. A column has the name that
-//! the user gives, else a name of the [dictionary](super::dictionary). Of several columns, the first whose values in the
-//! first rows can be read is chosen. A unit that does not fit the role is an error.
+//! In: the header and the options. Out: a [`Layout`] with the column and the unit of each role. A column has the name
+//! that the user gives, otherwise a name of the [dictionary](super::dictionary). If several columns fit, the first
+//! column whose first values can be read is chosen. A unit that does not fit the role is an error.
 
 use super::CsvOptions;
 use super::column_name::ColumnName;
@@ -15,31 +15,24 @@ use crate::io::table::{FirstRows, Header, PART_COLUMNS, TableError, parse_field}
 use crate::io::units::{Quantity, Unit};
 use crate::quantity::CellIndex;
 
-/// A column and its unit.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Column {
     pub(super) index: usize,
     pub(super) unit: &'static Unit,
-    /// Whether the header or the user states the unit.
     pub(super) is_stated: bool,
 }
 
-/// The columns of a table of samples.
 #[derive(Debug)]
 pub(super) struct Layout {
     pub(super) format: Format,
     pub(super) time: Column,
-    /// Whether the time restarts at each step.
     pub(super) is_step_time: bool,
-    /// The column of each channel, in the order of the channels.
     pub(super) channels: Vec<(Channel, Column)>,
     pub(super) state: Option<usize>,
-    /// Charge taken out, and its factor -1 or 1.
+    /// Charge taken out, with its factor: -1 for a net charge, otherwise 1.
     pub(super) discharged: Option<(Column, f64)>,
     pub(super) section: Option<usize>,
-    /// Whether the user names the section column.
     pub(super) is_section_named: bool,
-    /// Remarks for the user.
     pub(super) notes: Vec<String>,
 }
 
@@ -59,7 +52,6 @@ struct Columns<'a> {
     header: &'a Header,
     options: &'a CsvOptions,
     format: Format,
-    /// The known roles of each column.
     known: Vec<(usize, Known)>,
 }
 
@@ -72,20 +64,21 @@ impl<'a> Columns<'a> {
         let name = |index: usize| header.names()[index].trim();
         let is_bare_t = |index: usize, of: &Known| of.unit.is_none() && name(index).eq_ignore_ascii_case("t");
         let has_time = known.iter().any(|(index, of)| group(of.role) == Role::Date && !is_bare_t(*index, of));
-        // If the table has another time, `T` is a temperature and `t` is not used. Otherwise, both are the time.
+        // If the table has another column of time, `T` is a temperature and `t` is not used. Otherwise, both are
+        // times.
         let is_meant = |index: usize, of: &Known| match of.role {
             Role::Temperature => has_time && name(index) == "T",
             _ => !has_time,
         };
         known.retain(|(index, of)| !is_bare_t(*index, of) || is_meant(*index, of));
-        // In BioLogic's exports `Ewe` is the potential of one electrode, and `Ecell` the voltage.
+        // In BioLogic's exports, `Ewe` is the potential of one electrode, and `Ecell` is the voltage of the cell.
         let is = |index: usize, words: &str| ColumnName::parse(name(index), "").words == words;
         let has_ecell = known.iter().any(|(index, _)| is(*index, "ecell"));
         known.retain(|(index, _)| !has_ecell || !is(*index, "ewe"));
         Self { header, options, format: Format::of(header.names()), known }
     }
 
-    /// Drops the columns whose first values cannot be read, if those of another column can be.
+    /// Drops columns whose first values cannot be read, if another column of the same role can be read.
     fn keep_readable(&mut self, first: &FirstRows) {
         let readable: Vec<Role> =
             self.known.iter().filter(|(index, of)| is_readable(first, *index, of)).map(|of| group(of.1.role)).collect();
@@ -117,7 +110,7 @@ impl<'a> Columns<'a> {
         })
     }
 
-    /// Remarks on temperatures in an unknown unit.
+    /// Notes on temperature columns with an unknown unit.
     fn left_out(&self) -> Vec<String> {
         let unknown = self.unknown_units().filter(|(_, role, _)| *role == Role::Temperature);
         unknown
@@ -136,7 +129,7 @@ impl<'a> Columns<'a> {
         self.options.columns.iter().rev().find(|(r, _)| r == role).map(|(_, column)| column.as_str())
     }
 
-    /// The column that the user names. The name may end with a unit in brackets that the file does not have.
+    /// The column that the user names. A unit in brackets, which the file does not have, may follow the name.
     fn named(&self, role: &str, name: &str, quantity: Option<Quantity>) -> Result<Column, TableError> {
         let stated = name.strip_suffix(']').and_then(|rest| rest.rsplit_once('['));
         let exact = self.header.find(name).map(|index| (index, None));
@@ -185,7 +178,8 @@ impl<'a> Columns<'a> {
         ))
     }
 
-    /// The best columns of a role: the known names of the most preferred line, in the order of the file.
+    /// The best columns of a role, in the order of the file. Their names are in the most preferred line of the
+    /// dictionary.
     fn best_all(&self, role: Role) -> Vec<(usize, Known)> {
         let of_role = || self.known.iter().filter(|(_, known)| known.role == role);
         let best = of_role().map(|(_, known)| known.rank).min();
@@ -208,7 +202,7 @@ impl<'a> Columns<'a> {
         }
     }
 
-    /// The column of time, and whether its time restarts at each step. In Neware's exports `Time` is the time of the
+    /// The column of time, and whether its time restarts at each step. In Neware's exports, `Time` is the time of the
     /// step.
     fn time(&self) -> Result<(Column, bool), TableError> {
         if let Some(column) = self.mapped("time") {
@@ -231,7 +225,7 @@ impl<'a> Columns<'a> {
         }
     }
 
-    /// The column at whose new values the time restarts, and whether the user names it.
+    /// The section column, and whether the user names it. Time restarts at each new value of this column.
     fn section(&self, is_step_time: bool) -> Result<(Option<usize>, bool), TableError> {
         match self.mapped("section") {
             Some("") => Ok((None, true)),
@@ -244,7 +238,7 @@ impl<'a> Columns<'a> {
         }
     }
 
-    /// The columns of numbered sensors or cells that the user names by a pattern, as far as they exist.
+    /// The columns of numbered sensors or cells that the user names by a pattern, up to the first missing number.
     fn numbered(&self, role: &str, pattern: &str, quantity: Quantity, most: u16) -> Result<Vec<Column>, TableError> {
         let mut columns = Vec::new();
         for n in 0..most {
@@ -257,7 +251,6 @@ impl<'a> Columns<'a> {
         Ok(columns)
     }
 
-    /// Finds the temperature columns, which are optional: one column for the first sensor, or numbered columns.
     fn temperatures(&self, channels: &mut Vec<(Channel, Column)>) -> Result<(), TableError> {
         let sensors = |columns: Vec<Column>| {
             columns.into_iter().zip(0..).map(|(column, n)| (Channel::Temperature(SensorIndex(n)), column))
@@ -274,7 +267,7 @@ impl<'a> Columns<'a> {
             }
             None => {
                 let mut best = self.best_all(Role::Temperature);
-                // A sensor that the file has in two units counts once.
+                // If a sensor has columns in two units, it counts once.
                 let mut numbers = Vec::new();
                 best.retain(|(_, known)| {
                     let is_new = !numbers.contains(&known.number);
@@ -303,7 +296,7 @@ impl<'a> Columns<'a> {
             return Ok(());
         }
         if self.options.pack_total {
-            // A name that says that it is of the pack comes later in the dictionary.
+            // The dictionary lists names of the pack's voltage after names of the cell's voltage.
             let best = self.known.iter().filter(|of| of.1.role == Role::Voltage).map(|of| of.1.rank).max();
             let named = self.known.iter().find(|of| of.1.role == Role::Voltage && Some(of.1.rank) == best);
             let column = match (self.mapped("voltage"), named) {
@@ -322,7 +315,8 @@ impl<'a> Columns<'a> {
         Ok(())
     }
 
-    /// The columns of the cells by number, from 0 or from 1. The file has as many cells as the configuration.
+    /// The columns of the cell voltages, numbered from 0 or from 1. There must be as many as cells in the
+    /// configuration.
     fn cell_columns(&self) -> Result<Vec<Column>, TableError> {
         let cells = usize::from(self.options.cells);
         let mut found: Vec<(usize, Known)> =
@@ -356,7 +350,7 @@ impl<'a> Columns<'a> {
     }
 }
 
-/// Roles among which the readable columns are preferred: a time and a date replace each other.
+/// Maps roles that replace each other (time and date) to one role. Within this role, readable columns are preferred.
 fn group(role: Role) -> Role {
     if role == Role::Time { Role::Date } else { role }
 }
@@ -371,7 +365,7 @@ fn is_readable(first: &FirstRows, index: usize, known: &Known) -> bool {
             let mut reader = TimeText::new(known.unit.unwrap_or(Unit::base(Quantity::Time)));
             let texts: Vec<_> = rows().map(|row| row.text(index)).collect();
             reader.is_day_first = TimeText::is_day_first(&texts).0;
-            // Numbers may be in any unit, so their size does not matter.
+            // The unit of the numbers is unknown, so their size does not matter.
             let number = |text: &str| {
                 parse_field(text.as_bytes()).flatten().or_else(|| Some(reader.parse(text.as_bytes())?.secs()))
             };

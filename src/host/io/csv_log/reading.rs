@@ -1,4 +1,4 @@
-//! Says in one line what was read as what.
+//! Reports in one line how a table was read.
 
 use serde::Serialize;
 
@@ -9,18 +9,18 @@ use super::time_text::TimeForm;
 use super::{Channel, CsvOptions};
 use crate::io::table::Header;
 
-/// What was read of a table.
+/// How a table was read.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
 pub struct TableReading {
     /// Name of the file.
     pub file: String,
     /// The columns with their units, and the sign of the current.
     pub columns: String,
-    /// Rows until now.
+    /// Number of rows read so far.
     pub rows: u64,
-    /// Rows that could be read.
+    /// Number of rows without a bad field.
     pub read: u64,
-    /// Currents that were refused because they are impossible.
+    /// Number of currents that were rejected because they are impossible.
     pub refused_currents: u64,
     /// Whether a column of temperatures is read.
     #[serde(skip)]
@@ -59,14 +59,13 @@ impl TableReading {
         }
     }
 
-    /// Refuses an impossible current.
     pub(super) fn check(&mut self, current_a: Option<f64>, max_current_a: f64) -> Option<f64> {
         let possible = current_a.filter(|current_a| current_a.abs() <= max_current_a);
         self.refused_currents += u64::from(possible.is_none());
         possible
     }
 
-    /// Rows with usable values.
+    /// Number of rows without a bad field whose current was not rejected.
     pub fn accepted(&self) -> u64 {
         self.read.saturating_sub(self.refused_currents)
     }
@@ -77,7 +76,7 @@ impl std::fmt::Display for TableReading {
         if self.rows == 0 {
             return write!(f, "{}: {}", self.file, self.columns);
         }
-        // A share is not rounded up to 100 %.
+        // Round down, so that a share below 100 % is not shown as 100 %.
         let share = (1000.0 * self.accepted() as f64 / self.rows as f64).floor() / 10.0;
         write!(f, "{}: {}; {share} % of {} rows accepted", self.file, self.columns, grouped(self.rows))?;
         if self.refused_currents > 0 {
@@ -90,7 +89,6 @@ impl std::fmt::Display for TableReading {
 
 type Wanted = fn(&Channel) -> bool;
 
-/// The kinds of columns in the order of the message.
 const KINDS: [(&str, Wanted); 4] = [
     ("current", |channel| *channel == Channel::Current),
     ("voltage", |channel| matches!(channel, Channel::PackVoltage | Channel::CellVoltage(_))),

@@ -4,7 +4,6 @@
 //! [`Direction`], and the current with positive = discharge. `None` stands for a state without a direction, and for a
 //! current whose sign is unknown.
 
-/// Direction of the current in a row, according to the state column.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Direction {
     Charge,
@@ -14,18 +13,14 @@ pub(super) enum Direction {
 /// Parts of words for a discharge, without accents.
 const DISCHARGE: &str = "disch dsg entlad ontlad utlad urlad aflad descarg scaric rozlad \
     \u{440}\u{430}\u{437}\u{440}\u{44f}\u{434} \u{653e}\u{7535} \u{653e}\u{96fb}";
-/// Beginnings of words for a discharge. Elsewhere they may be of two words: `gridcharging`.
+/// Beginnings of words for a discharge. Inside a word they may be part of two words, as in `gridcharging`.
 const DISCHARGE_START: [&str; 3] = ["dch", "dsch", "dech"];
-/// Parts of words for a charge.
 const CHARGE: &str = "charg chrg chg regen lade ladu ladd ladn ladi ladow carga caric \
     \u{437}\u{430}\u{440}\u{44f}\u{434} \u{5145}\u{7535} \u{5145}\u{96fb}";
-/// Words for no current.
 const REST: &str = "r p s o rest resting pau pause pse idle stand standby ocv ocp wait waiting ruhe relax repos stop stopped open off end ready \
     full float finished none \u{9759}\u{7f6e} \u{6401}\u{7f6e} \u{4f11}\u{6b62}";
-/// Words that negate the others.
 const NEGATION: &str = "not no non nicht kein keine without";
 
-/// The words of a state in lower case, without accents.
 fn words(state: &[u8]) -> Vec<String> {
     let mut text = String::new();
     let (state, mut last) = (String::from_utf8_lossy(state), ' ');
@@ -48,7 +43,6 @@ fn words(state: &[u8]) -> Vec<String> {
     plain.split(|c: char| !c.is_alphanumeric()).filter(|word| !word.is_empty()).map(str::to_owned).collect()
 }
 
-/// Whether a state says that no current flows.
 pub(super) fn is_rest(state: &[u8]) -> bool {
     let words = words(state);
     let is_any = |list: &str| words.iter().any(|word| list.split(' ').any(|of| of == word));
@@ -67,7 +61,7 @@ pub(super) fn direction(state: &[u8]) -> Option<Direction> {
     match () {
         () if is(NEGATION) => None,
         () if is("d dis ent") || is_divided || is_begun || has(DISCHARGE) => Some(Direction::Discharge),
-        // `PULSEDCHG` and `GRIDCHG` cannot be told apart.
+        // `PULSEDCHG` (a discharge) and `GRIDCHG` (a charge) cannot be told apart.
         () if has("dchg dchrg") => None,
         () if is("c ch cha lad") || has(CHARGE) => Some(Direction::Charge),
         () => None,
@@ -84,18 +78,17 @@ pub(super) enum SignSource {
     Nothing,
 }
 
-/// Sign of the current.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct CurrentSign {
     pub(super) is_charge_positive: bool,
     /// Whether the current is a magnitude whose sign the state column gives.
     pub(super) is_by_state: bool,
-    /// Whether a charge with a positive current has occurred. With a discharge of this kind, it shows a magnitude.
+    /// Whether a charge with a positive current has occurred. If a discharge with a positive current has also
+    /// occurred, the current is a magnitude.
     pub(super) has_positive_charge: bool,
     pub(super) has_positive_discharge: bool,
-    /// Currents up to this size are noise of a current of zero (A).
+    /// Currents up to this size count as zero (A).
     pub(super) noise_a: f64,
-    /// Directions of states that are numbers.
     pub(super) codes: Vec<(Vec<u8>, Direction)>,
     pub(super) source: SignSource,
 }
@@ -113,7 +106,6 @@ impl CurrentSign {
         }
     }
 
-    /// The direction of a state.
     pub(super) fn direction(&self, state: &[u8]) -> Option<Direction> {
         direction(state).or_else(|| self.codes.iter().find(|(code, _)| code == state).map(|of| of.1))
     }
@@ -131,13 +123,15 @@ impl CurrentSign {
             if self.has_positive_charge && self.has_positive_discharge {
                 return None;
             }
-            // The first negative current shows a sign, which the one-sided rows before it could not show.
+            // This first negative current shows that the current has a sign. The rows before it had only one
+            // direction.
             self.is_by_state = false;
             self.is_charge_positive =
                 if is_discharge { !self.has_positive_discharge } else { self.has_positive_charge };
         }
         let discharge_a = if self.is_charge_positive { -value } else { value };
-        // A discharge in the state of a charge contradicts the sign that a single negative current has shown.
+        // If the state is a charge but the sign gives a discharge, the two contradict each other. The sign may come
+        // from a single negative current.
         let is_contradicted = self.noise_a > 0.0 && direction == Some(Direction::Charge) && discharge_a > self.noise_a;
         (!is_contradicted).then_some(discharge_a)
     }

@@ -57,7 +57,7 @@ fn signed_current_after_long_charge_keeps_sign() {
 
 #[test]
 fn one_sided_beginning_does_not_decide_magnitude() {
-    // A discharge of a megabyte, then a charge: signed with either sign, or a magnitude.
+    // One megabyte of discharge, then a charge. The current is signed, with either sign, or a magnitude.
     let rows = |sign: f64, word: &str, count: usize| -> String {
         (0..count).map(|_| format!("{},3.7,{word}\n", sign * 2.0)).collect()
     };

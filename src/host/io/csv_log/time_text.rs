@@ -1,13 +1,11 @@
-//! Reads the times of a table: numbers in a unit, durations with colons, or dates.
+//! Parses the times of a table: numbers in a unit, durations with colons, or dates.
 
 use crate::io::stamp;
 use crate::io::units::Unit;
 use crate::quantity::Timestamp;
 
-/// Days after which a time of day that begins anew belongs to the next day (ns).
 const DAY_NS: i64 = 86_400_000_000_000;
 
-/// How a table writes times.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum TimeForm {
     Number,
@@ -16,14 +14,11 @@ pub(super) enum TimeForm {
     Date,
 }
 
-/// Reader of times.
 #[derive(Debug, Clone)]
 pub(super) struct TimeText {
-    /// Unit of numbers.
     pub(super) unit: &'static Unit,
-    /// Whether the day precedes the month.
     pub(super) is_day_first: bool,
-    /// Whether a time of day that begins anew belongs to the next day.
+    /// Whether a time of day that restarts at midnight belongs to the next day.
     pub(super) wraps: bool,
     last_clock: Option<i64>,
     days: i64,
@@ -34,7 +29,6 @@ impl TimeText {
         Self { unit, is_day_first: false, wraps: true, last_clock: None, days: 0 }
     }
 
-    /// The form of a text.
     pub(super) fn form(text: &str) -> TimeForm {
         let text = text.trim();
         let Some(colon) = text.find(':') else { return TimeForm::Number };
@@ -43,8 +37,8 @@ impl TimeText {
         if is_date { TimeForm::Date } else { TimeForm::Clock }
     }
 
-    /// Whether dates begin with the day, and whether this is a guess: the order that makes the record shorter, or the
-    /// month. If the orders can read different dates, the order that can read more dates is used.
+    /// Whether dates begin with the day, and whether this is a guess. The order in which more dates can be read is
+    /// right. If all dates can be read in both orders, the order that gives the shorter record is a guess.
     pub(super) fn is_day_first(texts: &[impl AsRef<str>]) -> (bool, bool) {
         let read = |text: &str| [true, false].map(|is_day_first| stamp::parse_date(text, is_day_first));
         let dates: Vec<[Option<Timestamp>; 2]> =
@@ -60,7 +54,7 @@ impl TimeText {
         (day < month, true)
     }
 
-    /// Reads a time. Returns `None` if the text is none.
+    /// Parses a time; `None` if the text is not a time.
     pub(super) fn parse(&mut self, field: &[u8]) -> Option<Timestamp> {
         let field = field.strip_prefix(b"\"").and_then(|field| field.strip_suffix(b"\"")).unwrap_or(field);
         let is_seconds = self.unit.nanos() == Some(1_000_000_000);
@@ -80,7 +74,7 @@ impl TimeText {
             return count.checked_mul(nanos).map(Timestamp::from_nanos).filter(|time| is_representable(*time));
         }
         let seconds = self.unit.convert(text.parse().ok()?);
-        // Programs round minutes, hours and days to some digits, so the first sample after a minute is not at 60 s.
+        // Programs round minutes, hours and days to some digits, so a sample after one minute is not exactly at 60 s.
         let seconds = if self.unit.per_base() < 1.0 { (seconds * 1e4).round() / 1e4 } else { seconds };
         let time = seconds.is_finite().then(|| Timestamp::from_secs(seconds));
         time.filter(|time| is_representable(*time))
@@ -98,7 +92,7 @@ impl TimeText {
     }
 }
 
-/// Whether a time is not cut at the ends of the representable range (1677 to 2262).
+/// Whether a time lies within the representable range (1677 to 2262).
 fn is_representable(time: Timestamp) -> bool {
     !matches!(time.nanos(), i64::MIN | i64::MAX) && time.nanos().abs() < i64::MAX - 1
 }

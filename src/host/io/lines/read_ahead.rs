@@ -11,7 +11,6 @@ use std::thread;
 /// Number of blocks: one being filled, one being read, and two to absorb delays.
 const BLOCKS: usize = 4;
 
-/// The reading end.
 pub(super) struct ReadAhead {
     /// Filled blocks in order; an empty block marks the end.
     pieces: Receiver<io::Result<Vec<u8>>>,
@@ -23,7 +22,6 @@ pub(super) struct ReadAhead {
 }
 
 impl ReadAhead {
-    /// Starts reading `source` in blocks of `block_len` bytes.
     pub(super) fn new(source: impl Read + Send + 'static, block_len: usize) -> io::Result<Self> {
         let (full, pieces) = sync_channel(BLOCKS);
         let (used, empty) = channel();
@@ -66,7 +64,6 @@ impl Read for ReadAhead {
     }
 }
 
-/// Fills empty blocks until the source ends or fails, or the reader is dropped.
 fn work(mut source: impl Read, empty: &Receiver<Vec<u8>>, full: &SyncSender<io::Result<Vec<u8>>>) {
     while let Ok(mut block) = empty.recv() {
         block.clear();

@@ -20,16 +20,14 @@ use crate::quantity::{BusIndex, Timestamp};
 /// "...".
 const MAX_FOREIGN_NAMES: usize = 64;
 
-/// State shared by the parsers: counts, names, clock.
 pub(super) struct ReadState {
     pub(super) counts: LogCounts,
     pub(super) strict: bool,
     pub(super) interfaces: Vec<String>,
-    /// Number of configured interfaces, which are the first ones.
+    /// Number of configured interfaces. They come first in `interfaces`.
     #[cfg(feature = "formats")]
     pub(super) configured: usize,
     pub(super) channels: Vec<(String, String)>,
-    /// Parser that knows the interfaces.
     pub(super) parser: LineParser,
     /// Whether unconfigured interfaces also get a number, so that their records are returned.
     pub(super) adopt: bool,
@@ -43,14 +41,13 @@ pub(super) struct ReadState {
     pub(super) has_moved_stamps: bool,
 }
 
-/// Whether a line is blank or a comment.
 fn is_remark(line: &[u8]) -> bool {
     matches!(line.trim_ascii(), [] | [b'#' | b';' | b'%', ..])
 }
 
 impl ReadState {
-    /// Fills slots with the next frames of a text log, as far as complete lines are already in the buffer. Does nothing
-    /// before the first record of a file. Returns the number of frames.
+    /// Fills slots with the next frames of a text log. Uses only complete lines that are already in the buffer. Does
+    /// nothing before the first record of a file. Returns the number of frames.
     pub(super) fn next_frames(&mut self, lines: &mut Lines, name: &str, slots: &mut [Record]) -> usize {
         let Some(mut latest) = self.latest.filter(|_| !self.fresh) else { return 0 };
         let all = lines.unread();
@@ -93,7 +90,6 @@ impl ReadState {
         count
     }
 
-    /// Counts a record at `time`, which is before the time `latest` of an earlier record.
     #[cold]
     pub(super) fn note_backwards(&mut self, time: Timestamp, latest: Timestamp, place: impl FnOnce() -> String) {
         self.counts.time_backwards += 1;
@@ -170,7 +166,6 @@ impl ReadState {
     }
 
     pub(super) fn note_ignored(&mut self, name: &str, number: u64, line: &[u8]) {
-        /// Length of the quoted text, bytes.
         const SHOWN: usize = 60;
         self.counts.ignored_lines += 1;
         if self.counts.first_ignored_line.is_none() && !is_remark(line) {
@@ -195,7 +190,7 @@ impl ReadState {
             Line::Dropped { interface, frames } => {
                 self.counts.dropped_frames = self.counts.dropped_frames.saturating_add(frames);
                 let bus = self.bus(interface)?;
-                // The line has no stamp. The line belongs to the preceding frame, if any.
+                // The line has no stamp, so it belongs to the preceding frame, if any.
                 let time = self.latest?.plus_nanos(-self.shift_ns);
                 (!self.fresh).then_some(Record::bus(time, bus, BusEvent::Dropped { frames }))
             }
@@ -294,7 +289,6 @@ impl ReadState {
         Ok(wanted)
     }
 
-    /// Returns the number of a channel's interface. If the channel has none, counts the frame and returns `None`.
     #[cfg(feature = "formats")]
     pub(super) fn channel_bus(&mut self, log: &mut ToolLog, channel: u8) -> Option<BusIndex> {
         let bus = log.bus(channel, |channel| self.find_channel(channel));

@@ -1,4 +1,4 @@
-//! Writes segments and reads them back.
+//! Tests writing segments and reading them back.
 
 #![allow(clippy::unwrap_used, reason = "tests may panic")]
 
@@ -19,7 +19,6 @@ fn text(lines: u64) -> Vec<String> {
     lines
 }
 
-/// Writes the lines in pieces that do not end at line breaks.
 fn write(base: &Path, limits: SegmentLimits, lines: &[String]) {
     let mut writer = SegmentWriter::create(base, HEADER, limits).unwrap();
     let whole = lines.concat();

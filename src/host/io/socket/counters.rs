@@ -53,7 +53,6 @@ pub struct LinkHealth {
 pub(super) struct SharedHealth(Mutex<LinkHealth>);
 
 impl SharedHealth {
-    /// Changes the counts.
     pub(super) fn count(&self, note: impl FnOnce(&mut LinkCounts)) {
         self.change(|health| note(&mut health.counts));
     }
@@ -66,7 +65,6 @@ impl SharedHealth {
         });
     }
 
-    /// Changes the health and returns it.
     pub(super) fn change(&self, change: impl FnOnce(&mut LinkHealth)) -> LinkHealth {
         let mut health = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         change(&mut health);

@@ -28,7 +28,7 @@ use crate::quantity::{BusIndex, Timestamp};
 
 /// First pause before an interface that is down or missing is checked again.
 const FIRST_PAUSE: Duration = Duration::from_millis(100);
-/// Longest pause before such a check. A check costs a few system calls. If a missing interface returns, frames that
+/// Maximum pause before such a check. A check costs a few system calls. If a missing interface returns, frames that
 /// arrive before the check are lost.
 const LONGEST_PAUSE: Duration = Duration::from_secs(1);
 /// Number of frames read before other tasks run. A full 1 Mbit/s bus sends this many frames in 8 ms, which is less than
@@ -99,7 +99,6 @@ impl LinkOutput {
 /// Why the link stops using a socket.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum ServiceEnd {
-    /// The daemon stops.
     Stopped,
     /// The socket can no longer be used.
     Dead,
@@ -115,7 +114,6 @@ pub struct Link {
     unsent: Arc<AtomicU64>,
     health: Arc<SharedHealth>,
     state: LinkState,
-    /// Time of the latest change of the state.
     state_since: Timestamp,
     /// Number of frames lost since the last report: dropped by the kernel, malformed, or dropped because the daemon's
     /// inbox was full.
@@ -125,7 +123,6 @@ pub struct Link {
     last_problem: Option<String>,
 }
 
-/// An open socket and its state.
 struct OpenSocket {
     socket: AsyncFd<RawSocket>,
     mapper: StampMapper,
@@ -186,7 +183,6 @@ impl Link {
         }
     }
 
-    /// Opens the interface and reports its state as an event; `None` if it cannot be opened.
     async fn open(&mut self) -> Option<OpenSocket> {
         let LinkConfig { interface, fd, ids, patterns, all, receive_buffer_bytes, .. } = &self.config;
         let filters = if *all { every_frame() } else { filters(ids, patterns) };
@@ -211,7 +207,6 @@ impl Link {
         Some(OpenSocket { socket, mapper, received, dropped_total: 0, pending: None })
     }
 
-    /// Receives and sends until the socket is dead or the daemon stops.
     async fn serve(&mut self, mut open: OpenSocket) -> ServiceEnd {
         let end = self.serve_open(&mut open).await;
         self.note_dropped(&mut open);
@@ -229,8 +224,8 @@ impl Link {
                 ready = open.socket.ready(interest) => match ready {
                     Ok(mut guard) => {
                         let ready = guard.ready();
-                        // Readiness is cleared before the work. If the socket becomes ready during the work, the
-                        // runtime sets readiness again. The loop reads until the socket is empty.
+                        // Clear readiness before the work. If the socket becomes ready during the work, the runtime
+                        // sets readiness again.
                         guard.clear_ready_matching(if ready.is_writable() { Ready::WRITABLE } else { Ready::EMPTY });
                         guard.clear_ready_matching(Ready::READABLE | Ready::ERROR);
                         Ok(())
@@ -307,7 +302,6 @@ impl Link {
         self.config.all || self.config.ids.binary_search(&id).is_ok() || self.config.patterns.iter().any(fits)
     }
 
-    /// Forwards one frame or event.
     async fn take(&mut self, mapper: &mut StampMapper, received: &RawRead, reading: Reading) {
         let time = mapper.arrival(received.stamps, reading);
         // Frames that were in the socket when the interface went down do not show that the interface is up again.
@@ -331,7 +325,6 @@ impl Link {
         }
     }
 
-    /// Counts the frames that the kernel has dropped since the last call.
     fn note_dropped(&mut self, open: &mut OpenSocket) {
         let total = open.socket.get_ref().dropped_total();
         let dropped = u64::from(total.wrapping_sub(std::mem::replace(&mut open.dropped_total, total)));
@@ -342,7 +335,7 @@ impl Link {
     /// Sends the waiting frame if there is room. Returns `false` if the socket is dead.
     async fn send_pending(&mut self, open: &mut OpenSocket) -> bool {
         let Some(outgoing) = open.pending.take() else { return true };
-        // If the interface is not up, or the frame has waited so long that it is outdated, the frame is dropped.
+        // Drop the frame if the interface is not up, or if the frame has waited so long that it is outdated.
         let useless = self.state != LinkState::Up || outgoing.since.elapsed() > Duration::from_millis(500);
         let result = if useless { Err(Errno::ENETDOWN) } else { open.socket.get_ref().send(&outgoing.frame) };
         match result {
@@ -440,7 +433,6 @@ impl Link {
         self.lost > 0 || self.unsent.load(Ordering::Relaxed) > 0
     }
 
-    /// Reports the frames lost since the last report as events.
     async fn report_losses(&mut self, time: Timestamp) {
         let frames = std::mem::take(&mut self.lost);
         if frames > 0 {
@@ -452,8 +444,8 @@ impl Link {
         }
     }
 
-    /// Reports an event. Events are never dropped. If the inbox is full, the link waits; in that time the kernel queues
-    /// frames, or drops and counts them.
+    /// Reports an event. Events are never dropped. If the inbox is full, the link waits. In that time, the kernel
+    /// queues frames, or drops and counts them.
     async fn notify(&self, time: Timestamp, event: BusEvent) {
         // An error means that the daemon is stopping and no longer receives.
         let _ = self.inbox.send(Record::bus(time, self.config.bus, event)).await;

@@ -35,16 +35,15 @@ pub(super) const CALL_BATCH: usize = 16;
 /// Maximum number of filters that the kernel accepts (CAN_RAW_FILTER_MAX).
 const MAX_KERNEL_FILTERS: usize = 512;
 
-/// A frame read from the socket, and its stamps.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct RawRead {
     pub(super) what: Wire,
     pub(super) stamps: KernelStamps,
 }
 
-/// Buffers of one call, which are reused. Each call replaces the size of the control buffer in a header by the size
-/// that the kernel used, and the next call offers only this size. The size is sufficient while every frame has a stamp.
-/// After a frame without a stamp, the headers are built again.
+/// Buffers of one call, which are reused. A call overwrites the size of each control buffer with the size that the
+/// kernel used, so the next call offers only this size. This size suffices while every frame has a stamp. After a
+/// frame without a stamp, the headers are built again.
 struct Slots {
     headers: MultiHeaders<()>,
     bytes: [[u8; FD_BYTES]; CALL_BATCH],
@@ -67,7 +66,7 @@ impl Slots {
             let messages = recvmmsg(fd, &mut self.headers, slices.iter_mut(), MsgFlags::MSG_DONTWAIT, None)?;
             for (message, length) in messages.zip(&mut lengths) {
                 *length = message.bytes.min(FD_BYTES);
-                // An error means that a control message was cut off. This error is treated like a missing stamp.
+                // An error means that a control message was cut off. Treat it like a missing stamp.
                 let stamps = message.cmsgs().map_or(KernelStamps::default(), read_control);
                 into.push(RawRead { what: Wire::Malformed, stamps });
             }
@@ -87,11 +86,9 @@ thread_local! {
     static SLOTS: RefCell<Slots> = RefCell::new(Slots::new());
 }
 
-/// A bound, nonblocking raw socket.
 #[derive(Debug)]
 pub(super) struct RawSocket {
     socket: CanFdSocket,
-    /// The kernel's index of the interface.
     pub(super) index: u32,
 }
 
@@ -132,10 +129,7 @@ impl RawSocket {
         Ok(Self { socket, index })
     }
 
-    /// Like [`RawSocket::open`], but requires the interface to be up; errors contain its name.
-    ///
-    /// # Errors
-    /// Fails like [`RawSocket::open`], and also if the interface is down.
+    /// Like [`RawSocket::open`], but also fails if the interface is down. Errors contain the name of the interface.
     pub(super) fn open_up(interface: &str, fd: bool, filters: &[CanFilter], buffer_bytes: usize) -> io::Result<Self> {
         let opened = Self::open(interface, fd, filters, buffer_bytes);
         let opened = opened.and_then(|socket| socket.take_error()?.map_or(Ok(socket), Err));
@@ -195,10 +189,7 @@ impl AsFd for RawSocket {
     }
 }
 
-/// The kernel's index of an interface.
-///
-/// # Errors
-/// Returns `ENODEV` if no interface has this name.
+/// The kernel's index of an interface; `ENODEV` if no interface has this name.
 pub(super) fn index_of(interface: &str) -> io::Result<u32> {
     Ok(nix::net::if_::if_nametoindex(interface)?)
 }
@@ -227,7 +218,6 @@ pub(super) fn filters(ids: &[CanId], patterns: &[(u32, u32)]) -> Vec<CanFilter> 
     exact.chain(patterns).collect()
 }
 
-/// A filter that accepts every frame.
 pub(super) fn every_frame() -> Vec<CanFilter> {
     vec![CanFilter::new(0, 0)]
 }

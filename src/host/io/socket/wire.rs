@@ -28,7 +28,6 @@ const FD_ESI: u8 = 0x02;
 /// The content of one read from the kernel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Wire {
-    /// A data or remote frame.
     Frame(Frame),
     /// An error frame, given by its class bits.
     Error(u32),
@@ -36,7 +35,6 @@ pub(super) enum Wire {
     Malformed,
 }
 
-/// Decodes the bytes of one frame that the kernel returned.
 pub(super) fn decode(bytes: &[u8]) -> Wire {
     if bytes.len() != CLASSIC_BYTES && bytes.len() != FD_BYTES {
         return Wire::Malformed;

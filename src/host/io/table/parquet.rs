@@ -1,7 +1,7 @@
-//! Reads the rows of a Parquet file as text fields, so that tables of all kinds are read in the same way.
+//! Reads the rows of a Parquet file as text fields, so that all tables are read in the same way.
 //!
-//! In: a file. Out: one record per row; a null is an empty field, a time stamp a date in UTC. Row groups are read one
-//! after another.
+//! In: a file. Out: one record per row. A null becomes an empty field, a time stamp becomes a date in UTC. Row groups
+//! are read one after another.
 
 use std::fs::File;
 use std::path::Path;
@@ -15,11 +15,10 @@ use parquet::schema::types::Type;
 use super::{TableError, stamp};
 use crate::quantity::Timestamp;
 
-/// The rows of a Parquet file.
 pub(super) struct ParquetRows {
     rows: RowIter<'static>,
     number: u64,
-    /// Whether a column holds integers that are time stamps in nanoseconds.
+    /// For each column, whether it holds time stamps in nanoseconds as integers.
     is_nanos: Vec<bool>,
 }
 
@@ -37,12 +36,10 @@ impl ParquetRows {
         Ok((Self { rows: reader.into_iter(), number: 0, is_nanos }, names))
     }
 
-    /// Number of the row last read, from 1.
     pub(super) fn number(&self) -> u64 {
         self.number
     }
 
-    /// Reads the next row. Returns `false` at the end.
     pub(super) fn next(&mut self, record: &mut csv::ByteRecord) -> Result<bool, String> {
         let Some(row) = self.rows.next() else { return Ok(false) };
         let row = row.map_err(|error| format!("after row {}: {error}", self.number))?;

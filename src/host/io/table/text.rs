@@ -1,33 +1,29 @@
 //! Finds the form of a text table: encoding, separator, and the line of the header.
 //!
-//! In: the source. Out: its first megabyte as UTF-8, the rest as a reader, and the [`Form`]. A failed read is reported
-//! after the bytes before it.
+//! In: the source. Out: its first megabyte as UTF-8, the rest as a reader, and the [`Form`]. If a read fails, the
+//! bytes before the failure are returned first.
 
 use std::collections::VecDeque;
 use std::io::{self, Cursor, Read};
 
-/// Largest number of bytes that are examined before the first row is returned: one row of the greatest length.
+/// Maximum number of bytes that are examined before the first row is returned. It equals the maximum length of a row.
 const HEAD_BYTES: usize = super::MAX_ROW_BYTES;
 
-/// Largest number of lines before the header. The largest known preamble (EC-Lab with many techniques) has some
+/// Maximum number of lines before the header. The longest known preamble (EC-Lab with many techniques) has some
 /// hundred lines.
 const MAX_PREAMBLE_LINES: usize = 1000;
 
 /// Separators in the order of preference.
 const SEPARATORS: [u8; 4] = *b",;\t|";
 
-/// The beginning of a table.
 pub(super) struct Head {
     /// The first bytes as UTF-8, without a byte order mark.
     pub(super) bytes: Vec<u8>,
-    /// The bytes after the head.
     pub(super) rest: Box<dyn Read>,
-    /// Whether the head is the whole table.
     pub(super) is_whole: bool,
 }
 
 impl Head {
-    /// Reads the beginning of `source`.
     pub(super) fn read(source: Box<dyn Read>) -> Self {
         let mut source = source;
         let mut mark = Vec::new();
@@ -66,7 +62,6 @@ impl Read for FailedRead {
     }
 }
 
-/// Converts UTF-16 to UTF-8.
 struct Utf16 {
     source: io::BufReader<Box<dyn Read>>,
     little: bool,
@@ -77,7 +72,6 @@ struct Utf16 {
 }
 
 impl Utf16 {
-    /// The next character; `None` at the end.
     fn next_char(&mut self) -> io::Result<Option<char>> {
         loop {
             let mut pair = [0; 2];
@@ -109,10 +103,8 @@ impl Read for Utf16 {
     }
 }
 
-/// Form of a text table.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Form {
-    /// Separator of fields.
     pub(super) separator: u8,
     /// Offset of the header line in the head.
     pub(super) start: usize,
@@ -120,8 +112,8 @@ pub(super) struct Form {
     pub(super) is_known: bool,
 }
 
-/// Finds the header line. `score` rates the fields of a line: 0 = no header, else higher = more known columns. If no
-/// line is a header, the first line is.
+/// Finds the header line. `score` rates the fields of a line: 0 = not a header, higher = more known columns. If no
+/// line is a header, the first line counts as the header.
 pub(super) fn form(head: &[u8], score: &dyn Fn(&[String]) -> usize) -> Form {
     let mut start = 0;
     let mut first = None;
@@ -140,7 +132,7 @@ pub(super) fn form(head: &[u8], score: &dyn Fn(&[String]) -> usize) -> Form {
                 let fields = split(line, separator);
                 (score(&fields), separator)
             });
-            // Of equal scores the first separator counts.
+            // If scores are equal, the first separator counts.
             let best = rated.rev().max_by_key(|&(score, _)| score);
             if let Some((_, separator)) = best.filter(|&(score, _)| score > 0 || announced == Some(number)) {
                 return Form { separator, start, is_known: true };
@@ -159,7 +151,6 @@ fn announced_header(line: &[u8]) -> Option<usize> {
     text.trim().strip_prefix("Nb header lines")?.trim_start_matches([' ', ':', '\t']).trim().parse().ok()
 }
 
-/// The separator that occurs most often in a line.
 fn most_frequent(line: &[u8]) -> u8 {
     let count = |separator: u8| line.iter().filter(|&&byte| byte == separator).count();
     SEPARATORS.into_iter().rev().max_by_key(|&separator| count(separator)).unwrap_or(b',')
@@ -172,7 +163,7 @@ fn split(line: &[u8], separator: u8) -> Vec<String> {
     join_quoted(&parts, separator).into_iter().map(text).collect()
 }
 
-/// Whether a part of a line is the beginning of a quoted field that holds separators. Quotes within it are doubled.
+/// Whether a part of a line begins a quoted field that contains separators. Quotes inside the field are doubled.
 pub(super) fn opens_quote(part: &[u8]) -> bool {
     part.trim_ascii_start().starts_with(b"\"") && has_odd_quotes(part)
 }
@@ -181,7 +172,7 @@ fn has_odd_quotes(part: &[u8]) -> bool {
     memchr::memchr_iter(b'"', part).count() % 2 == 1
 }
 
-/// Joins the parts of quoted fields that hold separators. A quote without an end stays.
+/// Joins the parts of quoted fields that contain separators. A quote without an end is kept.
 pub(super) fn join_quoted(parts: &[&[u8]], separator: u8) -> Vec<Vec<u8>> {
     let mut fields = Vec::new();
     let mut rest = parts;

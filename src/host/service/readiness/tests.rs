@@ -7,7 +7,7 @@ use crate::monitor::{MonitorConfig, Outputs, Record};
 use crate::quantity::{BusIndex, Timestamp};
 use std::path::Path;
 
-/// A core, its readiness and the time of both.
+/// A monitor and its readiness state, with the simulated time of both.
 struct Scene {
     monitor: Monitor,
     readiness: Readiness,

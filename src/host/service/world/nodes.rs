@@ -1,4 +1,5 @@
-//! What surrounds the daemon in a simulated life: its configuration, the sender of authenticated commands, and chance.
+//! The surroundings of the daemon in a simulated life: its configuration, the sender of authenticated commands, and a
+//! random number generator.
 
 use std::fs;
 use std::path::Path;
@@ -110,7 +111,7 @@ impl Dice {
     }
 }
 
-/// The sender of authenticated commands. It follows the announced freshness.
+/// A sender of authenticated commands. It uses the freshness that the daemon announces.
 #[derive(Default)]
 pub(super) struct Sender {
     announced: u64,
@@ -121,7 +122,7 @@ impl Sender {
     const COMMAND: Authentication = Authentication { profile: Profile::Fd, data_id: 0x0321 };
     const ANNOUNCEMENT: Authentication = Authentication { profile: Profile::Announcement, data_id: 0x0322 };
 
-    /// Follows an announcement. Returns its freshness.
+    /// Handles an announcement. Returns the announced freshness.
     pub(super) fn hear(&mut self, frame: &Frame) -> Option<u64> {
         let sent = Self::ANNOUNCEMENT.sent_freshness(frame.data())?;
         let span = 1 << Profile::Announcement.freshness_bits();
@@ -136,7 +137,8 @@ impl Sender {
         Some(found)
     }
 
-    /// A command "acknowledge all"; `None` = nothing announced, or all announced values used.
+    /// Makes a command that acknowledges all alarms. `None` = no freshness was announced, or all announced values are
+    /// used.
     pub(super) fn command(&mut self) -> Option<Frame> {
         let freshness = self.next.filter(|next| *next < self.announced + 16)?;
         self.next = Some(freshness + 1);

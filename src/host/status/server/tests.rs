@@ -35,7 +35,6 @@ fn connect(path: &Path) -> UnixStream {
     stream
 }
 
-/// Reads until the end of the stream.
 fn rest(mut stream: UnixStream) -> Vec<u8> {
     let mut all = Vec::new();
     let _ = stream.read_to_end(&mut all);

@@ -87,7 +87,7 @@ fn pack_change_closes_history_and_opens_next() {
         entries.iter().map(|entry| (entry.kind, entry.pack)).collect::<Vec<_>>(),
         [(HistoryTable::Reset, 1), (HistoryTable::Capacity, 2)]
     );
-    // The stored state knows later pack changes than the database.
+    // The stored state contains a later pack number than the database.
     let path = folder.path().join(DATABASE);
     assert_eq!(Database::open(&path, &Stamp::replayed(Timestamp::ZERO), 5).unwrap().pack(), 5);
     assert_eq!(open(folder.path()).pack(), 5);

@@ -7,7 +7,6 @@ use crate::monitor::ModelState;
 use crate::quantity::catalogue::{Quantity, RecordedPackValues, RecordedValues};
 use crate::quantity::{CellIndex, Mode};
 
-/// A capacity of a cell, with or without a measurement.
 pub(in crate::store) fn capacity(cell: u16, measured_ah: Option<f64>, usable_ah: f64) -> EventKind {
     EventKind::Capacity {
         cell: CellIndex(cell),
@@ -20,7 +19,6 @@ pub(in crate::store) fn capacity(cell: u16, measured_ah: Option<f64>, usable_ah:
     }
 }
 
-/// A half-cycle of a cell.
 pub(in crate::store) fn half_cycle(cell: u16) -> EventKind {
     EventKind::HalfCycle {
         cell: CellIndex(cell),
@@ -34,7 +32,6 @@ pub(in crate::store) fn half_cycle(cell: u16) -> EventKind {
     }
 }
 
-/// Loss modes of a cell.
 pub(in crate::store) fn loss_modes(cell: u16, lli: f64) -> EventKind {
     EventKind::LossModes {
         cell: CellIndex(cell),
@@ -47,7 +44,6 @@ pub(in crate::store) fn loss_modes(cell: u16, lli: f64) -> EventKind {
     }
 }
 
-/// A remaining life of the pack, cycles.
 pub(in crate::store) fn remaining_life(cycles: f64) -> EventKind {
     EventKind::RemainingLife {
         cell: Some(CellIndex(2)),
@@ -72,7 +68,6 @@ pub(in crate::store) fn model(capacity_ah: Option<f64>) -> EventKind {
     }
 }
 
-/// An alarm of the pack.
 pub(in crate::store) fn alarm(change: Change) -> EventKind {
     EventKind::Alarm {
         rule: Rule::SocLow,

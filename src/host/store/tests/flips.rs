@@ -1,8 +1,8 @@
 //! Flips single bits of a small store. After each flip, the store can be written again, and the learned capacity
 //! survives.
 //!
-//! By default the test flips a sample of the bits. `PACKWATCH_FLIPS=all` tests every bit, `PACKWATCH_FLIPS=N` every
-//! N-th bit. The counts are printed.
+//! By default, the test flips a sample of the bits. `PACKWATCH_FLIPS=all` tests every bit, `PACKWATCH_FLIPS=N` every
+//! N-th bit.
 
 use super::*;
 
@@ -10,7 +10,6 @@ use super::*;
 /// place of a page.
 const SAMPLE_STEP: usize = 397;
 
-/// Effects of the flips.
 #[derive(Debug, Default)]
 struct FlipCounts {
     flips: usize,
@@ -18,8 +17,8 @@ struct FlipCounts {
     set_aside: usize,
     /// Number of flips after which the newest state was not found.
     older: usize,
-    /// Flips after which an altered row was shown, no undamaged state was found, nothing could be written, or the written
-    /// state or the history's rows were missing at the next start.
+    /// Flips with a failure: an altered row was shown, no undamaged state was found, nothing could be written, or the
+    /// written state or the history's rows were missing at the next start.
     failed: Vec<(&'static str, usize, String)>,
 }
 
@@ -31,7 +30,6 @@ struct Reference {
     now: Stamp,
     /// The state that is written after each flip.
     next: StateDocument,
-    /// The rows of the history.
     entries: Vec<HistoryEntry>,
 }
 

@@ -14,7 +14,6 @@ fn replayed_store() -> (tempfile::TempDir, Snapshot) {
     (place, end)
 }
 
-/// Damages both states.
 fn without_states(place: &Path) {
     for name in state_files::FILES {
         std::fs::write(place.join("state").join(name), "nothing").unwrap();
@@ -111,7 +110,6 @@ fn missing_and_damaged_state_give_different_errors() {
     assert!(required().unwrap_err().contains("contains no stored state (state-a.json.zst, state-b.json.zst)"));
 }
 
-/// Returns a change of an alarm that the configuration of these tests contains.
 fn change(change: Change, occurrences: u32, acknowledged: bool) -> EventKind {
     let state = if change == Change::Raised { AlarmState::Active } else { AlarmState::Inactive };
     EventKind::Alarm {

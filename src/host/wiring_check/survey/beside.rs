@@ -1,9 +1,8 @@
-//! Finds signals that the DBC files describe, that are not configured, and that can be compared with configured
-//! signals.
+//! Finds unconfigured signals of the DBC files that can be compared with configured signals.
 //!
-//! In: the DBC files and the configured signals. Out: signals that measure the pack's voltage, a temperature of its
-//! cells or a state of charge, according to their names and units. Each signal is bound to every interface, because a DBC does not state which bus
-//! it describes.
+//! In: the DBC files and the configured signals. Out: signals whose names and units say that they measure the pack's
+//! voltage, a temperature of its cells or a state of charge. Each signal is bound to every interface, because a DBC
+//! does not state which bus it describes.
 
 use crate::can::dbc::{Message, Signal};
 use crate::can::decode::Binding;
@@ -18,7 +17,7 @@ pub(super) fn signals(raw: &RawTables, databases: &Databases, found: &[ResolvedS
     let is_configured = |signal: &Signal| found.iter().any(|resolved| std::ptr::eq(resolved.signal, signal));
     let free = databases.signals().filter(|named| !is_configured(named.signal));
     let wanted = free.filter_map(|named| Some((named, channel_of(raw, named.message, named.signal)?)));
-    // Temperatures come last: a pack may have more of them than the limit below allows.
+    // Temperatures come last, because a pack may have more temperatures than the limit below allows.
     let mut wanted: Vec<_> = wanted.collect();
     wanted.sort_by_key(|(_, channel)| matches!(channel, Channel::Temperature(_)));
     let buses = u8::try_from(raw.interfaces.len()).unwrap_or(u8::MAX);
@@ -33,7 +32,7 @@ pub(super) fn signals(raw: &RawTables, databases: &Databases, found: &[ResolvedS
     bound.take(64).collect()
 }
 
-/// What a signal measures, according to its name and unit; `None` = the signal is not comparable.
+/// The channel that a signal measures, according to its name and unit; `None` = the signal is not comparable.
 fn channel_of(raw: &RawTables, message: &Message, signal: &Signal) -> Option<Channel> {
     let label = SignalLabel::new(&message.name, &signal.name, &signal.unit);
     let is = |quantity| !label.says_extreme() && label.score(quantity).is_some_and(|score| score.points >= 3.0);
@@ -42,7 +41,7 @@ fn channel_of(raw: &RawTables, message: &Message, signal: &Signal) -> Option<Cha
     } else if is(PackQuantity::Temperature) && label.is_of_pack() && !label.is_of_other_part() {
         Some(Channel::Temperature(SensorIndex(0)))
     } else {
-        // A signal that cannot exceed half of the range holds only the decimals of a state of charge.
+        // A signal that cannot exceed half of the range contains only the decimal places of a state of charge.
         let highest = signal.layout.extent().1;
         let is_whole = highest > 50.0 || signal.unit.is_empty() && (0.9..=1.5).contains(&highest);
         (is(PackQuantity::Soc) && is_whole && !label.is_of_low_voltage()).then_some(Channel::ReportedSoc)

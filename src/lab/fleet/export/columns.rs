@@ -1,6 +1,6 @@
 //! Defines the columns of the exported tables: name, type, unit, meaning and value.
 //!
-//! The writers, the schema of the Parquet files and the page `docs/src/reference/export.md` all use this definition. An
+//! The writers, the schema of the Parquet files and the page `docs/src/reference/export.md` use this definition. An
 //! unknown value is null (an empty field in CSV), never NaN. Cells count from 0; a positive current discharges.
 
 use std::borrow::Cow;
@@ -16,10 +16,9 @@ use crate::health::Remaining;
 use crate::quantity::Timestamp;
 use crate::quantity::catalogue::{Part, Quantity, RECORDED, RECORDED_OF_PACK, RecordedPackValues};
 
-/// Type of a column.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum ColumnType {
-    /// A time: microseconds since 1970, UTC; in CSV written as 2008-04-02T13:08:17.921000Z.
+    /// A time: microseconds since 1970, UTC. CSV has the form 2008-04-02T13:08:17.921000Z.
     Time,
     /// A number.
     Real,
@@ -54,7 +53,7 @@ impl ColumnType {
     }
 }
 
-/// A value of a column; a `None` in a variant means unknown.
+/// A value of a column; `None` in a variant = unknown.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum FieldValue<'r> {
     Time(Timestamp),
@@ -64,28 +63,24 @@ pub(super) enum FieldValue<'r> {
     Word(Option<Cow<'r, str>>),
 }
 
-/// A column of a table with rows `R`.
 pub(super) struct Column<R> {
     pub(super) name: &'static str,
     pub(super) unit: &'static str,
     pub(super) kind: ColumnType,
-    /// Whether the value may be null.
     pub(super) optional: bool,
     pub(super) about: &'static str,
     source: ColumnSource<R>,
 }
 
-/// Source of a column's value.
 enum ColumnSource<R> {
     Value(for<'r> fn(&'r R) -> FieldValue<'r>),
-    /// A number in the event, found by the name of the column.
+    /// A number in the event that has the name of the column.
     Field(fn(&R) -> &Fields),
     /// A value of the pack.
     Quantity(Quantity, Part, fn(&R) -> &RecordedPackValues),
 }
 
 impl<R> Column<R> {
-    /// Returns the value of the column in a row.
     pub(super) fn value<'r>(&self, row: &'r R) -> FieldValue<'r> {
         match self.source {
             ColumnSource::Value(value) => value(row),
@@ -113,7 +108,6 @@ macro_rules! columns {
     (@) => { false };
 }
 
-/// Columns of `estimates`.
 pub(super) const ESTIMATES: &[Column<EstimateRow>] = &columns! { EstimateRow;
     "log" Word "", "name of the log and of its folder", |row| text(&row.log);
     "time" Time "UTC", "time of the voltage reading", |row| FieldValue::Time(row.estimate.time);
@@ -136,8 +130,6 @@ pub(super) const ESTIMATES: &[Column<EstimateRow>] = &columns! { EstimateRow;
     "temperature_c" Real "degrees C" null, "temperature used", |row| real(row.estimate.measured.temperature_c);
 };
 
-/// Columns of `half_cycles`: the half-cycle, the recorded quantities after it, the losses of the cell, and its
-/// remaining life.
 pub(super) static HALF_CYCLES: LazyLock<Vec<Column<HalfCycleRow>>> = LazyLock::new(|| {
     let half_cycle = columns! { HalfCycleRow;
         "log" Word "", "name of the log and of its folder", |row| text(&row.log);
@@ -172,13 +164,11 @@ pub(super) static HALF_CYCLES: LazyLock<Vec<Column<HalfCycleRow>>> = LazyLock::n
     half_cycle.into_iter().chain(RECORDED.into_iter().flat_map(recorded)).chain(forecast).collect()
 });
 
-/// Returns the columns of a recorded quantity.
 fn recorded(quantity: Quantity) -> impl Iterator<Item = Column<HalfCycleRow>> {
     let about = quantity.row().cell.map_or("", |it| it.about);
     columns_of(quantity, about, |_, _| ColumnSource::Field(|row: &HalfCycleRow| &row.capacity))
 }
 
-/// Returns the columns of a quantity: the mean and, if the quantity has one, the standard deviation.
 fn columns_of<R>(
     quantity: Quantity,
     about: &'static str,
@@ -195,7 +185,6 @@ fn columns_of<R>(
     })
 }
 
-/// Columns of `outlook`.
 pub(super) static OUTLOOK: LazyLock<Vec<Column<OutlookRow>>> = LazyLock::new(|| {
     let moment = columns! { OutlookRow;
         "log" Word "", "name of the log and of its folder", |row| text(&row.log);
@@ -211,7 +200,6 @@ pub(super) static OUTLOOK: LazyLock<Vec<Column<OutlookRow>>> = LazyLock::new(|| 
     moment.into_iter().chain(values).collect()
 });
 
-/// Columns of `alarms`.
 pub(super) const ALARMS: &[Column<AlarmRow>] = &columns! { AlarmRow;
     "log" Word "", "name of the log and of its folder", |row| text(&row.log);
     "time" Time "UTC", "time of the change", |row| FieldValue::Time(row.time);
@@ -230,7 +218,6 @@ pub(super) const ALARMS: &[Column<AlarmRow>] = &columns! { AlarmRow;
     "acknowledged" Flag "", "whether the alarm was acknowledged", |row| FieldValue::Flag(row.alarm.flag("acknowledged"));
 };
 
-/// Columns of `use_record`.
 pub(super) const USE_RECORD: &[Column<UseRow>] = &columns! { UseRow;
     "log" Word "", "name of the log and of its folder", |row| text(&row.log);
     "counter" Word "", "path of the number in the record of use, with its unit", |row| text(&row.counter);

@@ -1,10 +1,10 @@
-//! Merges the tables of vehicles from several runs into one Parquet file per table. Vehicles are sorted by name; each
-//! has its own row groups.
+//! Merges the tables of vehicles from several runs into one Parquet file per table. Vehicles are sorted by name, and
+//! each has its own row groups.
 //!
 //! Input: folders written by [`run`](crate::fleet::vehicles::run). Output: `vehicles.parquet` with a row for each
-//! vehicle, including vehicles that failed; `half_cycles.parquet`; `outlook.parquet`; `alarms.parquet`;
-//! `use_record.parquet`; and, if estimates were exported, `estimates.parquet`; and `models.jsonl` with the learned
-//! models. The bytes do not depend on which machine replayed a vehicle or on the order of the replays. Column chunks are copied, so memory does not grow with the number of rows.
+//! vehicle, including failed vehicles; the tables `half_cycles`, `outlook`, `alarms`, `use_record` and, if exported,
+//! `estimates`; and `models.jsonl` with the learned models. The bytes depend neither on the machine that replayed a
+//! vehicle nor on the order of the replays.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -27,7 +27,6 @@ pub struct MergeSummary {
     pub rows: BTreeMap<String, u64>,
 }
 
-/// A replayed vehicle, and the folder of its tables.
 struct VehicleFolder {
     folder: PathBuf,
     record: VehicleRecord,
@@ -73,7 +72,6 @@ pub fn merge(folders: &[PathBuf], wanted: Option<&[Vehicle]>, out: &Path) -> Res
     Ok(summary)
 }
 
-/// Returns the vehicles of all folders by name.
 fn read_all(folders: &[PathBuf]) -> Result<BTreeMap<String, VehicleFolder>, LabError> {
     let mut vehicles: BTreeMap<String, VehicleFolder> = BTreeMap::new();
     for folder in folders {
@@ -144,7 +142,6 @@ fn check(vehicles: &BTreeMap<String, VehicleFolder>, wanted: Option<&[Vehicle]>)
     Ok(())
 }
 
-/// Formats the first few names.
 fn first_names(names: &[&str]) -> String {
     let shown: usize = 8;
     let more = if names.len() > shown { ", ..." } else { "" };

@@ -12,14 +12,12 @@ use crate::monitor::Estimate;
 use crate::quantity::Timestamp;
 use crate::quantity::catalogue::RecordedPackValues;
 
-/// An estimate of a cell.
 pub(super) struct EstimateRow {
     pub(super) log: Arc<str>,
     pub(super) since_s: f64,
     pub(super) estimate: Estimate,
 }
 
-/// A half-cycle of a cell, what was learned from the half-cycle, and the remaining life of the cell.
 pub(super) struct HalfCycleRow {
     pub(super) log: Arc<str>,
     pub(super) time: Timestamp,
@@ -31,11 +29,9 @@ pub(super) struct HalfCycleRow {
     pub(super) capacity: Fields,
     /// Lithium and active material that the cell has lost; `None` = unknown.
     pub(super) losses: Option<LossModes>,
-    /// Remaining life of the cell; `None` = there are not enough data.
     pub(super) remaining: Option<RemainingLife>,
 }
 
-/// A change of an alarm.
 pub(super) struct AlarmRow {
     pub(super) log: Arc<str>,
     pub(super) time: Timestamp,
@@ -45,7 +41,6 @@ pub(super) struct AlarmRow {
     pub(super) alarm: Fields,
 }
 
-/// Energy and power of the pack after a half-cycle.
 pub(super) struct OutlookRow {
     pub(super) log: Arc<str>,
     pub(super) time: Timestamp,
@@ -54,7 +49,6 @@ pub(super) struct OutlookRow {
     pub(super) values: RecordedPackValues,
 }
 
-/// A number of the record of use.
 pub(super) struct UseRow {
     pub(super) log: Arc<str>,
     /// Path of the number in the record, such as `rest.above_80_s`.
@@ -63,7 +57,6 @@ pub(super) struct UseRow {
 }
 
 impl UseRow {
-    /// Returns a row for each known number of a record.
     pub(super) fn of_record(log: &Arc<str>, record: &UseRecord) -> Result<Vec<Self>, serde_json::Error> {
         let mut rows = Vec::new();
         let mut waiting = vec![(String::new(), serde_json::to_value(record)?)];

@@ -1,8 +1,7 @@
 //! Writes a table of rows as a Parquet or CSV file.
 //!
-//! Input: rows, and the metadata of the file. Memory holds the rows of one row group. The file gets its final name when
-//! it is complete ([`ResultFile`]). In a Parquet file, a required value that is missing, or a value of the wrong type,
-//! causes an error and is never written.
+//! Memory holds the rows of one row group. The file gets its final name when it is complete ([`ResultFile`]). In a
+//! Parquet file, a missing required value or a value of the wrong type is an error.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -25,7 +24,6 @@ use crate::io::stamp;
 /// Number of rows of a row group. Estimates then need about 10 MB of memory, and readers can skip row groups.
 const GROUP_ROWS: usize = 65_536;
 
-/// A table of rows `R` that is being written.
 pub(super) struct TableFile<R: 'static> {
     path: PathBuf,
     columns: &'static [Column<R>],
@@ -38,7 +36,7 @@ enum TableWriter {
     Parquet { out: Box<SerializedFileWriter<ResultFile>>, group: Vec<ColumnBuffer>, rows: usize },
 }
 
-/// Values of one column in the unfinished row group, and which rows have a value.
+/// Values of one column in the unfinished row group. `present` states which rows have a value.
 struct ColumnBuffer {
     present: Vec<i16>,
     list: ColumnValues,
@@ -83,7 +81,7 @@ impl<R> TableFile<R> {
     /// Writes a row.
     ///
     /// # Errors
-    /// The row cannot be written, or (in a Parquet file) a value is missing or has the wrong type for its column.
+    /// The row cannot be written. In a Parquet file, a missing value or a value of the wrong type is also an error.
     pub(super) fn push(&mut self, row: &R) -> Result<(), LabError> {
         self.rows += 1;
         match &mut self.writer {
@@ -188,7 +186,6 @@ fn append_group(
     copy.close().map(drop)
 }
 
-/// Returns the schema in the syntax of Parquet.
 fn schema<R>(columns: &[Column<R>]) -> String {
     let line = |column: &Column<R>| {
         let (physical, logical) = column.kind.parquet();
@@ -198,7 +195,7 @@ fn schema<R>(columns: &[Column<R>]) -> String {
     format!("message packwatch {{ {} }}", columns.iter().map(line).collect::<Vec<_>>().join(" "))
 }
 
-/// Adds the name of the file to an error. Errors of the operating system already contain it.
+/// Adds the file name to an error, unless the error of the operating system already contains it.
 fn named_error(path: &Path, error: &ParquetError) -> LabError {
     let (path, text) = (path.display().to_string(), error.to_string());
     LabError::Data(if text.contains(&path) { text } else { format!("{path}: cannot be written: {text}") })
@@ -207,7 +204,7 @@ fn named_error(path: &Path, error: &ParquetError) -> LabError {
 fn csv_field(field: &FieldValue<'_>) -> String {
     match field {
         FieldValue::Time(time) => stamp::format_utc_micros(*time),
-        // The shortest text that is read back as the same number.
+        // The shortest text that reads back as the same number.
         FieldValue::Real(value) => value.map(|value| format!("{value:?}")).unwrap_or_default(),
         FieldValue::Whole(value) => value.map(|value| value.to_string()).unwrap_or_default(),
         FieldValue::Flag(value) => value.to_string(),
@@ -227,7 +224,6 @@ impl ColumnBuffer {
         Self { present: Vec::new(), list }
     }
 
-    /// Adds a value. Returns false if the value does not fit the column.
     fn push(&mut self, field: FieldValue<'_>, optional: bool) -> bool {
         let present = match (&mut self.list, field) {
             (ColumnValues::Micros(list), FieldValue::Time(time)) => put(list, Some(time.nanos().div_euclid(1000))),

@@ -1,28 +1,27 @@
-//! Finds what the key of a `--set` choice refers to, and sets its value in a configuration.
+//! Finds what the key of a `--set` option refers to, and sets its value in a configuration.
 
 use toml::{Table, Value};
 
 use super::{Choice, VariantGrid};
 use crate::alarm::Rule;
 
-/// Severities as they are written in keys, the mildest first.
+/// Severities in keys, the mildest first.
 const SEVERITIES: [&str; 3] = ["info", "warning", "severe"];
-/// Other keys of an `[[alarm]]` table that a choice can set.
+/// Other keys of an `[[alarm]]` table that `--set` can replace.
 const ALARM_KEYS: [&str; 8] =
     ["when", "probability", "hysteresis", "debounce_s", "debounce_events", "latched", "spn", "fmi"];
 
-/// The part of a configuration that a key refers to.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Target {
-    /// A threshold of a rule: its severity, and whether the `set` or the `clear` value is meant.
+    /// A threshold of a rule, with its severity and either `set` or `clear`.
     Threshold { rule: Rule, severity: &'static str, part: &'static str },
     /// Another key of all `[[alarm]]` tables of a rule.
     Alarm { rule: Rule, key: &'static str },
-    /// Any other key: its parts, each with the number in brackets, if it has one.
+    /// Any other key: its parts, each with its number in brackets, if it has one.
     Key(Vec<(String, Option<usize>)>),
 }
 
-/// Finds what the choices refer to. Records the rules in `grid`.
+/// Finds what the choices refer to. Adds their rules to `grid`.
 pub(super) fn targets(grid: &mut VariantGrid, root: &Table, choices: &[Choice]) -> Result<Vec<Target>, String> {
     let mut targets: Vec<Target> = Vec::new();
     for choice in choices {
@@ -90,7 +89,6 @@ impl Target {
         Ok(Self::Key(parts))
     }
 
-    /// Sets the value in the configuration.
     pub(super) fn set(&self, root: &mut Table, value: &Value) -> Result<(), String> {
         match self {
             Self::Threshold { rule, severity, part } => set_threshold(root, *rule, severity, part, value),
@@ -113,7 +111,7 @@ impl Target {
     }
 }
 
-/// Changes the message of a fault about an unknown table, because the key may be a misspelt rule.
+/// Adds rule names to a fault about an unknown table, because the key may be a misspelt rule.
 pub(super) fn name_rules(fault: String, targets: &[Target]) -> String {
     let unknown = targets.iter().find_map(|target| match target {
         Target::Key(parts) => {
@@ -134,7 +132,6 @@ fn alarms_of(root: &mut Table, rule: Rule) -> impl Iterator<Item = &mut Table> {
     alarms.filter(move |alarm| rule_of(alarm) == Some(rule.name())).filter_map(Value::as_table_mut)
 }
 
-/// Returns the most severe level that the configuration sets for a rule.
 fn gravest(root: &Table, rule: Rule) -> Result<&'static str, String> {
     let alarms = root.get("alarm").and_then(Value::as_array).into_iter().flatten();
     let of_rule: Vec<&Value> = alarms.filter(|alarm| rule_of(alarm) == Some(rule.name())).collect();
@@ -155,7 +152,7 @@ fn set_threshold(root: &mut Table, rule: Rule, severity: &str, part: &str, value
     }
     let Some(alarm) = alarms_of(root, rule).nth(place) else { return Err(format!("no [[alarm]] of {}", rule.name())) };
     match (alarm.get_mut(severity), part) {
-        // The other value in the file (`set` or `clear`) stays.
+        // Of the pair `set` and `clear`, only one value is replaced.
         (Some(Value::Table(both)), part) => {
             both.insert(part.to_owned(), value.clone());
         }
@@ -193,7 +190,6 @@ fn set_key(root: &mut Table, parts: &[(String, Option<usize>)], value: &Value) -
     Ok(())
 }
 
-/// Returns the rule of an `[[alarm]]` table.
 pub(super) fn rule_of(alarm: &Value) -> Option<&str> {
     alarm.get("rule")?.as_str()
 }

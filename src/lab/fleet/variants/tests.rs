@@ -17,7 +17,7 @@ rule = \"input_missing\"
 severe = 5.0
 ";
 
-/// Writes the configuration of the demo with the alarms above into a folder.
+/// Writes the demo's configuration with the alarms above into a folder.
 fn written(folder: &tempfile::TempDir) -> PathBuf {
     let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config");
     let text = fs::read_to_string(shipped.join("demo.toml")).expect("shipped");
@@ -78,7 +78,7 @@ fn percentages_texts_and_tables_are_accepted() {
 #[test]
 fn other_keys_and_input_missing_need_separate_replays() {
     let grid = made(&["estimator.voltage_noise_v=0.005,0.01", "capacity_low.warning=1.9,1.8"]).expect("good");
-    // The first value of the noise is the default, which the file does not state.
+    // The first noise is the default, which the file does not state.
     assert_eq!((grid.variants.len(), grid.replays, grid.other_keys), (5, 3, true));
     assert_eq!(made(&["input_missing.severe=4.0,6.0"]).expect("good").replays, 3);
 }

@@ -1,47 +1,43 @@
-//! Calibrates the local width of an interval on forecasts whose errors are known. The window of such a forecast is
+//! Calibrates the local width of an interval on forecasts with known errors. The lag window of such a forecast is
 //! called a judged window.
 //!
-//! The errors of a cell's voltage are tiny during a charge at constant voltage and large at the end of a discharge.
-//! With one factor for all windows, the interval would be too wide in the charge and too narrow at the end of the
-//! discharge. The width is therefore computed in three steps:
+//! The errors of a cell's voltage are tiny during a charge at constant voltage and large at the end of a discharge. A
+//! single width would be too wide in the charge and too narrow at the end of the discharge. The width is therefore
+//! computed in three steps:
 //!
 //! * ratio = |error| / standard deviation, for every judged window.
 //! * spread of a window = (sum of the ratios of its n nearest judged windows + k m) / ((n + k) m), where m is the mean
 //!   of all ratios and k is [`SHRINKAGE`].
-//! * factor = 95 % quantile of ratio / spread over all judged windows. The spread of a judged window is computed here
-//!   without this window and the windows that overlap it.
+//! * factor = 95 % quantile of ratio / spread over all judged windows. Here the spread of a judged window excludes the
+//!   window itself and the windows that overlap it.
 //!
 //! Half the width of the interval at a window is factor x spread x standard deviation.
 
 use crate::regress::GAUSSIAN;
 
-/// Number of nearest judged windows that determine the spread of a window.
+/// Number of nearest judged windows (n) that determine the spread of a window.
 const NEAR: usize = 20;
 /// Weight of the mean of all ratios relative to one window.
 const SHRINKAGE: f64 = 4.0;
-/// If there are fewer judged windows, all windows have the same spread, and the interval is at least as wide as the
-/// interval of a normal distribution.
+/// With fewer judged windows, all windows have the same spread, and the interval is at least as wide as that of a
+/// normal distribution.
 const FEWEST: usize = 100;
 
-/// Judged windows.
 #[derive(Debug)]
 pub(super) struct Spread {
     pub(super) factor: f64,
     width: usize,
-    /// Rows of the windows, rising. The ratios are in the same order.
+    /// Rows of the judged windows, rising. The ratios are in the same order.
     rows: Vec<usize>,
     ratios: Vec<f64>,
-    /// Mean of all ratios.
     mean: f64,
-    /// Features of all windows, divided by `units`.
     windows: Vec<f64>,
-    /// Standard deviation of every feature.
     units: Vec<f64>,
 }
 
 impl Spread {
-    /// Calibrates on judged windows, given by their rows (rising), features and ratios. Windows overlap if they are
-    /// less than `overlap` rows apart.
+    /// Calibrates on judged windows with these rows (rising), features and ratios. Windows less than `overlap` rows
+    /// apart overlap.
     pub(super) fn new(rows: Vec<usize>, features: &[f64], ratios: Vec<f64>, overlap: usize) -> Self {
         let count = rows.len();
         let width = features.len().checked_div(count).unwrap_or(0);
@@ -57,12 +53,10 @@ impl Spread {
         spread
     }
 
-    /// Returns the number of judged windows.
     pub(super) fn count(&self) -> usize {
         self.rows.len()
     }
 
-    /// Returns half the width of the interval at a window, in standard deviations.
     pub(super) fn half_width(&self, features: &[f64]) -> f64 {
         if self.rows.len() < FEWEST {
             return self.factor;
@@ -70,8 +64,8 @@ impl Spread {
         self.factor * self.at(&scaled(features, &self.units), None)
     }
 
-    /// Returns the spread of a window with scaled features. With `but` = (row, overlap), windows that overlap the
-    /// window at this row are left out.
+    /// Returns the spread of a window with scaled features. `but` = (row, overlap) excludes the windows that overlap
+    /// the window at this row.
     fn at(&self, window: &[f64], but: Option<(usize, usize)>) -> f64 {
         if self.rows.len() < FEWEST || self.mean <= 0.0 {
             return 1.0;
@@ -103,8 +97,8 @@ fn deviation<'a>(values: impl Iterator<Item = &'a f64> + Clone) -> f64 {
     if deviation > 1e-12 * mean.abs() { deviation } else { 1.0 }
 }
 
-/// Returns the 95 % quantile, corrected for small samples. If there are few ratios, chance could make the interval too
-/// narrow. The result is then at least the value of a normal distribution.
+/// Returns the 95 % quantile, corrected for small samples. With few ratios, it is at least the value of a normal
+/// distribution, because chance could make the interval too narrow.
 fn factor(mut ratios: Vec<f64>) -> f64 {
     ratios.sort_by(f64::total_cmp);
     let rank = ((ratios.len() + 1) as f64 * 0.95).ceil() as usize;
@@ -132,7 +126,7 @@ mod tests {
 
     #[test]
     fn intervals_are_wide_where_errors_were_large() {
-        // Two regimes: every tenth window belongs to the second, in which errors are ten times larger.
+        // Every tenth window belongs to a second regime, in which errors are ten times larger.
         let large = |k: usize| k % 10 == 3;
         let ratio = |k: usize| (k * 7919 % 1000) as f64 / 1000.0 * if large(k) { 10.0 } else { 1.0 };
         let features: Vec<f64> = (0..2000).flat_map(|k| [if large(k) { 5.0 } else { 0.0 }, (k % 7) as f64]).collect();

@@ -1,15 +1,15 @@
-//! Finds the rows of a table that have a lag window. The lag window of a row has, for each column, the value and the
-//! latest differences.
+//! Finds the rows of a table that have a lag window. The lag window of a row contains, for each column, the value and
+//! the latest differences.
 
 use super::super::ColumnTable;
 
-/// The windows of a table.
+/// The lag windows of a table.
 #[derive(Debug)]
 pub struct LagWindows<'a> {
     table: &'a ColumnTable,
     columns: usize,
     lags: usize,
-    /// For each row, the first row of its part (an independent section of the table), and the first row after its part.
+    /// First row of each row's part (an independent section of the table), and first row after this part.
     part: Vec<(usize, usize)>,
 }
 
@@ -23,8 +23,7 @@ pub struct RowSpacing {
 }
 
 impl RowSpacing {
-    /// Returns the steps of a time column within the parts of the table; `None` = no two consecutive rows of a part
-    /// have times.
+    /// Returns the steps of a time column within the parts of the table; `None` = no part has two consecutive times.
     pub fn of(table: &ColumnTable, column: usize) -> Option<Self> {
         let times: Vec<f64> = table.column(column).collect();
         let steps = (1..times.len()).filter(|row| table.parts.binary_search(row).is_err());
@@ -43,7 +42,7 @@ impl RowSpacing {
 }
 
 impl<'a> LagWindows<'a> {
-    /// Creates windows over the required columns of the table, with `lags` values of each.
+    /// Creates windows over the required columns of the table, with `lags` values per column.
     pub fn new(table: &'a ColumnTable, lags: usize) -> Self {
         let ends = table.parts.iter().skip(1).copied().chain([table.len()]);
         let spans = table.parts.iter().copied().zip(ends);
@@ -81,8 +80,8 @@ impl<'a> LagWindows<'a> {
         self.value(row + steps, column) - self.value(row, column)
     }
 
-    /// Returns the windows of rows, one after the other: for every column the value, then the differences, the latest
-    /// first.
+    /// Returns the windows of `rows`, one after the other. For every column, a window has the value, then the
+    /// differences, the latest first.
     pub fn features(&self, rows: &[usize]) -> Vec<f64> {
         let mut all = Vec::with_capacity(rows.len() * self.width());
         for &row in rows {

@@ -1,5 +1,4 @@
-//! Tests the fit of a cell model. The records are simulated with known tables, so the tests can compare the fitted
-//! tables with the known tables. Other tests check that the fit rejects unusable data.
+//! Tests the fit of a cell model on records that are simulated with known tables, and the rejection of unusable data.
 
 use super::*;
 use crate::cell::circuit::BranchAt;
@@ -11,7 +10,6 @@ use crate::ident::record::Limits;
 const LIMITS: Limits = Limits { voltage_low_v: 1.0, voltage_high_v: 5.0, capacity_ah: 2.0 };
 const CAPACITY_AH: f64 = 2.0;
 
-/// Reproducible noise in [-0.5, 0.5].
 fn scatter(k: usize) -> f64 {
     let x = (k as f64 * 12.9898).sin() * 43758.5453;
     x - x.floor() - 0.5
@@ -57,7 +55,6 @@ fn grid() -> Grid {
     Grid { soc: vec![0.0, 0.1, 0.3, 0.6, 1.0], temperature_c: vec![5.0, 25.0] }
 }
 
-/// Cell with two branches and realistic resistances.
 fn truth() -> CellModel {
     let grid = grid();
     let theta = truth_theta(&grid);
@@ -113,7 +110,7 @@ fn gradient_agrees_with_finite_differences() {
     let grid = grid();
     let layout = Layout::new(&grid, 2);
     // The temperatures of the rows lie between the grid's two temperatures, so all four corners of a grid cell
-    // contribute. The offsets that are added to `theta` below keep the residuals large.
+    // contribute. The offsets added to `theta` below keep the residuals large.
     let record = {
         let mut record = simulate(&truth(), 25.0, 0.005, &grid);
         for row in &mut record.rows {
@@ -152,13 +149,13 @@ fn known_parameters_are_recovered_from_noisy_data() {
     let grid = grid();
     let truth = truth();
     let records: Vec<Record> = [5.0, 25.0].iter().map(|&t| simulate(&truth, t, 0.002, &grid)).collect();
-    // The noise is white here, so one second contains more information than in real data.
+    // Each second has weight 10, because white noise averages out faster than the errors of real data.
     let fitted = fit(&settings(grid.clone()), &records, &[10.0, 10.0], |_, _| {}).expect("a fit");
     assert!(fitted.converged && fitted.total.rmse_v < 0.002, "{:?}", fitted.total);
     let expected = truth_theta(&grid);
     let layout = Layout::new(&grid, 2);
     let true_tables = ParameterTables::new(&layout, &expected);
-    // There is little data below SOC 0.3.
+    // Nodes below SOC 0.3 are not checked, because there is little data.
     for node in (0..10).filter(|node| node % 5 >= 2) {
         let ocv_error = fitted.tables.ocv_v[node] - true_tables.ocv_v[node];
         assert!(ocv_error.abs() < 0.015, "OCV node {node}: {ocv_error}");
@@ -176,8 +173,7 @@ fn ocv_rises_where_the_data_fall() {
     let grid = grid();
     let mut records = vec![simulate(&truth(), 25.0, 0.0, &grid)];
     for row in &mut records[0].rows {
-        // Above SOC 0.6, subtract 0.8 V per unit of SOC from the measured voltage. This removes almost the whole rise
-        // of the open-circuit curve, which is 0.825 V per unit of SOC.
+        // This removes almost the whole rise of the open-circuit curve above SOC 0.6, which is 0.825 V per unit of SOC.
         row.voltage_v -= 0.8 * (row.soc - 0.6).max(0.0);
     }
     let fitted = fit(&settings(grid), &records, &[1.0], |_, _| {}).expect("a fit");

@@ -1,19 +1,19 @@
-//! Computes the resistances and branches of a BPX cell. The cell's equations have these closed solutions for small
-//! currents:
+//! Computes the resistances and branches of a BPX cell. For small currents, the cell's equations have these closed
+//! solutions:
 //!
 //! | part | resistance | time constant | source |
 //! | --- | --- | --- | --- |
 //! | charge transfer, each electrode | `R T / (F j0 S)`, `j0 = F k sqrt(x (1 - x))` | none: part of R0 | Butler-Volmer with equal coefficients |
 //! | electrolyte | `(L_n / 3 k_n + L_s / k_s + L_p / 3 k_p) / A` | none: part of R0 | SPMe, Marquis et al., J. Electrochem. Soc. 166 (2019) A3693, eq. 40 |
-//! | solid | `(L_n / s_n + L_p / s_p) / 3 A` | none: part of R0 | the same |
-//! | concentration of the electrolyte | `2 R T (1 - t)^2 / (F^2 A c) (L_n / 3 D_n + L_s / D_s + L_p / 3 D_p)` | `sum(L / D) sum(e L) / pi^2` | the same; slowest mode of a layer without exchange at its ends |
+//! | solid | `(L_n / s_n + L_p / s_p) / 3 A` | none: part of R0 | Marquis et al., eq. 40 |
+//! | concentration of the electrolyte | `2 R T (1 - t)^2 / (F^2 A c) (L_n / 3 D_n + L_s / D_s + L_p / 3 D_p)` | `sum(L / D) sum(e L) / pi^2` | Marquis et al., eq. 40; slowest mode of a layer without exchange at its ends |
 //! | diffusion in a particle, each electrode | `abs(dU/dx) r / (5 D F c_max S)` | `r^2 / 35 D` | sphere under constant flux; first moment of its step response |
 //!
 //! `S` is the surface of all particles of an electrode, `A` the area of all electrode pairs. In the row of charge
 //! transfer, `k` is the rate constant. In the rows of the electrolyte, `k` and `D` of a layer are the values of the
-//! electrolyte, multiplied by the transport efficiency of the layer. Each property follows Arrhenius' law with its
-//! activation energy, or with [`USUAL_J_PER_MOL`] if none is stated. BPX has no double layer, so charge transfer has no
-//! time constant here. After about 0.1 s, this makes no difference.
+//! electrolyte, multiplied by the layer's transport efficiency. Each property follows Arrhenius' law with its stated
+//! activation energy or with [`USUAL_J_PER_MOL`]. Charge transfer has no time constant because BPX has no double layer,
+//! which matters only for about 0.1 s.
 
 use super::curve::Curve;
 use super::document::{BpxCell, Electrode, Layer, Transport};
@@ -21,24 +21,20 @@ use super::{FARADAY_C_PER_MOL, GAS_J_PER_MOL_K};
 use crate::cell::model::ACTIVATION_ENERGY_J_PER_MOL as USUAL_J_PER_MOL;
 use crate::quantity::bounds::{Bounds, CAPACITANCE_F, RESISTANCE_OHM};
 
-/// The slope of a potential is computed between the lithium contents this far below and above. This distance is so
-/// large that the noise of a table does not count as slope.
+/// Half of the range of lithium content over which the slope of a potential is computed. It is wide enough that the
+/// noise of a table does not count as slope.
 const SLOPE_STEP: f64 = 0.005;
 
-/// Smallest resistance (ohm) and smallest time constant (s): a flat potential gives 0, but a model needs a positive
-/// value.
+/// Smallest resistance (ohm) and time constant (s). A flat potential gives 0, but a model needs positive values.
 const LEAST: f64 = 1e-7;
 
-/// Resistances and time constants at one SOC and temperature.
 #[derive(Debug, Clone)]
 pub(super) struct Resistances {
     pub(super) r0_ohm: f64,
-    /// Resistance (ohm) and time constant (s).
     pub(super) branches: Vec<(f64, f64)>,
 }
 
 impl Resistances {
-    /// Sum of all resistances (ohm).
     pub(super) fn settled_ohm(&self) -> f64 {
         self.r0_ohm + self.branches.iter().map(|branch| branch.0).sum::<f64>()
     }
@@ -57,8 +53,8 @@ impl Resistances {
     }
 }
 
-/// Returns the resistances at a SOC and a temperature (K). The branch of the electrolyte comes first, if the file
-/// describes the electrolyte; the branches of the electrodes follow.
+/// Returns the resistances at a SOC and a temperature (K). The branch of the electrolyte, if the file describes it,
+/// comes before the branches of the electrodes.
 pub(super) fn resistances(cell: &BpxCell, curve: &Curve<'_>, soc: f64, temperature_k: f64) -> Resistances {
     let (x, y) = curve.contents(soc);
     let at = |energy: Option<f64>| arrhenius(energy, cell.reference_k, temperature_k);
@@ -95,7 +91,6 @@ fn arrhenius(j_per_mol: Option<f64>, reference_k: f64, temperature_k: f64) -> f6
     libm::exp(energy / GAS_J_PER_MOL_K * (1.0 / reference_k - 1.0 / temperature_k))
 }
 
-/// Surface of all particles of an electrode, m2.
 fn surface_m2(electrode: &Electrode, area_m2: f64) -> f64 {
     electrode.surface_per_m * electrode.thickness_m * area_m2
 }
@@ -113,7 +108,7 @@ fn particle(electrode: &Electrode, area_m2: f64, content: f64, diffusivity: f64)
     (slope_v / (FARADAY_C_PER_MOL * mol_per_s), radius_m * radius_m / (35.0 * diffusivity))
 }
 
-/// Sums thickness / (property x transport efficiency) over the layers. For electrodes, a third of the value counts.
+/// Sums thickness / (property x transport efficiency) over the layers. An electrode counts one third.
 fn path(layers: &[Layer; 3], property: f64) -> f64 {
     let of = |layer: &Layer| layer.thickness_m / (property * layer.transport_efficiency);
     of(&layers[0]) / 3.0 + of(&layers[1]) + of(&layers[2]) / 3.0

@@ -3,21 +3,19 @@
 //! `u(soc, T) = u_p(y) - u_n(x) + (T - T_ref) (du_p/dT(y) - du_n/dT(x))` with the lithium contents `x` (negative) and
 //! `y` (positive). The cyclable lithium follows from the full cell in the file: the negative electrode has its maximum
 //! lithium content, the positive electrode its minimum. At the reference temperature, SOC 1 has the upper cut-off
-//! voltage and SOC 0 the lower one, as in PyBaMM's ElectrodeSOH (Mohtat et al., J. Power Sources 427 (2019) 101, eqs. 5
-//! to 8). Units: V, Ah, K.
+//! voltage and SOC 0 the lower cut-off voltage. The method is that of PyBaMM's ElectrodeSOH (Mohtat et al., J. Power
+//! Sources 427 (2019) 101, eqs. 5 to 8). Units: V, Ah, K.
 
 use super::FARADAY_C_PER_MOL;
 use super::document::{BpxCell, Electrode};
 use crate::filter::bisect;
 
-/// Smallest rise of the open-circuit voltage between breakpoints (V). A voltage that rises by less, or falls, is
-/// raised.
+/// Smallest rise of the open-circuit voltage between breakpoints (V). Voltages that rise by less are raised.
 const LEAST_RISE_V: f64 = 2e-5;
 
 /// Number of points between two breakpoints at which the interpolation is checked.
 const PROBES: usize = 15;
 
-/// Lithium contents of a full and of an empty cell.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Curve<'a> {
     cell: &'a BpxCell,
@@ -25,11 +23,9 @@ pub(super) struct Curve<'a> {
     pub(super) negative: [f64; 2],
     /// Lithium content of the positive electrode at SOC 0 and 1.
     pub(super) positive: [f64; 2],
-    /// Charge between the cut-offs (Ah).
     pub(super) capacity_ah: f64,
 }
 
-/// The curve on a grid.
 #[derive(Debug, Clone)]
 pub(super) struct CurveTable {
     pub(super) soc: Vec<f64>,
@@ -40,7 +36,6 @@ pub(super) struct CurveTable {
 }
 
 impl Electrode {
-    /// Charge of the lithium that fits into the electrode (Ah).
     pub(super) fn capacity_ah(&self, area_m2: f64) -> f64 {
         let volume_share = self.surface_per_m * self.radius_m / 3.0;
         FARADAY_C_PER_MOL * volume_share * self.thickness_m * area_m2 * self.concentration_max / 3600.0
@@ -51,7 +46,7 @@ impl<'a> Curve<'a> {
     /// Finds the lithium contents at the cut-offs.
     ///
     /// # Errors
-    /// The voltage does not reach a cut-off. Each fault states the path, what was found and what is allowed.
+    /// The voltage does not reach a cut-off.
     pub(super) fn new(cell: &'a BpxCell) -> Result<Self, Vec<String>> {
         let (n, p) = (&cell.negative, &cell.positive);
         let [q_n, q_p] = [n, p].map(|electrode| electrode.capacity_ah(cell.area_m2));
@@ -61,12 +56,12 @@ impl<'a> Curve<'a> {
         let ends = (((lithium_ah - q_p) / q_n).max(0.0) + 1e-9, (lithium_ah / q_n).min(1.0) - 1e-9);
         let mut faults = Vec::new();
         let mut content = |key: &str, cut_off_v: f64| {
-            // Search outwards from the stated lithium content, so that a bend of a potential far from this content is
-            // not found.
+            // Search outwards from the stated lithium content, because far from this content, the potential may not be
+            // monotone.
             let [full, empty] = [n.stoichiometry[1], n.stoichiometry[0]].map(|x| x.clamp(ends.0, ends.1));
             let near = if key == "Upper" { full } else { empty };
             let (low, high) = bracket(near, ends, |x| voltage_v(x) < cut_off_v);
-            // Accurate to 1e-15.
+            // 50 steps give an accuracy of 1e-15.
             let x = bisect((low, high), 50, |x| voltage_v(x) < cut_off_v).1;
             let reached_v = voltage_v(x);
             let is_reached = (reached_v - cut_off_v).abs() < 1e-3;
@@ -94,13 +89,11 @@ impl<'a> Curve<'a> {
         }
     }
 
-    /// Lithium contents of the negative and the positive electrode.
     pub(super) fn contents(&self, soc: f64) -> (f64, f64) {
         let between = |[empty, full]: [f64; 2]| empty + soc * (full - empty);
         (between(self.negative), between(self.positive))
     }
 
-    /// Open-circuit voltage (V).
     pub(super) fn voltage_v(&self, soc: f64, temperature_k: f64) -> f64 {
         let (x, y) = self.contents(soc);
         let BpxCell { negative: n, positive: p, reference_k, .. } = self.cell;
@@ -129,8 +122,8 @@ impl<'a> Curve<'a> {
         Ok(table)
     }
 
-    /// Returns the SOC breakpoints. The interval with the largest interpolation error is halved until no error exceeds
-    /// 1 mV (at most 80 breakpoints, at least 1e-4 apart).
+    /// Returns at most 80 SOC breakpoints, at least 1e-4 apart. The interval with the largest interpolation error is
+    /// halved until no error exceeds 1 mV.
     fn nodes(&self) -> Vec<f64> {
         let mut nodes: Vec<f64> = (0..=10).map(|k| f64::from(k) / 10.0).collect();
         let mut errors: Vec<f64> = nodes.windows(2).map(|ends| self.line_error_v(ends[0], ends[1])).collect();
@@ -157,8 +150,7 @@ impl<'a> Curve<'a> {
     }
 }
 
-/// Returns an interval around `near` in which the predicate changes from true to false, or `ends` if no such interval
-/// is found.
+/// Returns an interval around `near` in which the predicate changes from true to false; `ends` = there is none.
 fn bracket(near: f64, ends: (f64, f64), is_below: impl Fn(f64) -> bool) -> (f64, f64) {
     let mut step = 1e-4;
     while step < 1.0 {
@@ -171,7 +163,7 @@ fn bracket(near: f64, ends: (f64, f64), is_below: impl Fn(f64) -> bool) -> (f64,
     ends
 }
 
-/// Returns the row with each value raised, if necessary, to [`LEAST_RISE_V`] above the previous value.
+/// Raises each value, if necessary, to [`LEAST_RISE_V`] above the previous value.
 fn rising(row: &[f64], raised_v: &mut f64) -> Vec<f64> {
     let mut least_v = f64::NEG_INFINITY;
     let mut raise = |voltage_v: f64| {

@@ -1,8 +1,7 @@
 //! Reads the parameters for a cell model from the JSON of a BPX file.
 //!
-//! Input: the JSON, versions 0.x and 1.x, models SPM, SPMe and DFN. Output: [`BpxCell`], in the file's SI units. Every
-//! fault is recorded with its path in the JSON, what was found and what is allowed. Reading continues after a fault, so
-//! that all faults are reported.
+//! Input: the JSON, versions 0.x and 1.x, models SPM, SPMe and DFN. Output: [`BpxCell`], in the file's SI units.
+//! Reading continues after a fault, so that all faults are reported.
 
 use serde_json::{Map, Value};
 
@@ -11,14 +10,10 @@ use super::function::{Function, found};
 /// Reference temperature if the file does not state it (K).
 const USUAL_TEMPERATURE_K: f64 = 298.15;
 
-/// Parameters of a BPX file for a cell model.
 #[derive(Debug, Clone)]
 pub(super) struct BpxCell {
-    /// Title of the file.
     pub(super) title: Option<String>,
-    /// References of the file, or its description.
     pub(super) references: Option<String>,
-    /// Version of the format.
     pub(super) version: String,
     /// SPM, SPMe or DFN.
     pub(super) model: String,
@@ -26,59 +21,53 @@ pub(super) struct BpxCell {
     pub(super) voltage_min_v: f64,
     pub(super) voltage_max_v: f64,
     pub(super) reference_k: f64,
-    /// Area of all electrode pairs together, m2.
+    /// Sum of the areas of all electrode pairs (m2).
     pub(super) area_m2: f64,
     pub(super) negative: Electrode,
     pub(super) positive: Electrode,
     /// Transport in the electrolyte; `None` for the model SPM.
     pub(super) transport: Option<Transport>,
-    /// Heat capacity (J/K) if density, volume and specific heat capacity are stated.
+    /// Heat capacity (J/K); `None` = density, volume or specific heat capacity is missing.
     pub(super) heat_capacity_j_per_k: Option<f64>,
-    /// Thermal resistance to the surroundings, K/W, if heat transfer coefficient and surface are stated.
+    /// Thermal resistance to the surroundings (K/W); `None` = heat transfer coefficient or surface is missing.
     pub(super) thermal_k_per_w: Option<f64>,
-    /// Notes on the conversion for the user.
     pub(super) notes: Vec<String>,
 }
 
-/// One electrode with one active material.
 #[derive(Debug, Clone)]
 pub(super) struct Electrode {
     pub(super) thickness_m: f64,
     pub(super) surface_per_m: f64,
     pub(super) radius_m: f64,
-    /// Largest concentration of lithium in the active material, mol/m3.
+    /// Largest concentration of lithium in the active material (mol/m3).
     pub(super) concentration_max: f64,
-    /// Lowest and highest lithium content.
     pub(super) stoichiometry: [f64; 2],
     pub(super) ocp_v: Function,
-    /// Change of the potential with temperature, V/K; 0 if not stated.
+    /// Change of the potential with temperature (V/K); 0 if not stated.
     pub(super) entropic: Function,
-    /// Diffusivity of lithium in the particles, m2/s.
+    /// Diffusivity of lithium in the particles (m2/s).
     pub(super) diffusivity: Function,
     pub(super) diffusivity_j_per_mol: Option<f64>,
-    /// Rate constant of the charge transfer, mol/(m2 s).
+    /// Rate constant of the charge transfer (mol/(m2 s)).
     pub(super) reaction_rate: f64,
     pub(super) reaction_j_per_mol: Option<f64>,
 }
 
-/// Transport through the cell: layers (negative electrode, separator, positive electrode), solid and electrolyte.
 #[derive(Debug, Clone)]
 pub(super) struct Transport {
     pub(super) layers: [Layer; 3],
-    /// Conductivity of the solid of the negative and positive electrode, S/m.
+    /// Conductivity of the solid of the negative and positive electrode (S/m).
     pub(super) solid_s_per_m: [f64; 2],
-    /// Concentration of the electrolyte, mol/m3.
     pub(super) concentration: f64,
     pub(super) transference: f64,
-    /// Conductivity of the electrolyte at this concentration, S/m.
+    /// Conductivity of the electrolyte at this concentration (S/m).
     pub(super) conductivity: f64,
     pub(super) conductivity_j_per_mol: Option<f64>,
-    /// Diffusivity of the electrolyte at this concentration, m2/s.
+    /// Diffusivity of the electrolyte at this concentration (m2/s).
     pub(super) diffusivity: f64,
     pub(super) diffusivity_j_per_mol: Option<f64>,
 }
 
-/// A layer that contains electrolyte.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Layer {
     pub(super) thickness_m: f64,
@@ -86,7 +75,7 @@ pub(super) struct Layer {
     pub(super) transport_efficiency: f64,
 }
 
-/// Allowed values of a number: greater than the first value, at most the second.
+/// Range of a number: above the first value, at most the second.
 type Above = (f64, f64);
 
 const POSITIVE: Above = (0.0, f64::MAX);
@@ -95,7 +84,7 @@ const SHARE: Above = (0.0, 1.0);
 /// Reads the JSON.
 ///
 /// # Errors
-/// The JSON has faults. Each fault states the path, what was found and what is allowed.
+/// The JSON has faults.
 pub(super) fn read(root: &Value) -> Result<BpxCell, Vec<String>> {
     let mut faults = Vec::new();
     let cell = Section::root(root).cell(&mut faults);
@@ -105,7 +94,7 @@ pub(super) fn read(root: &Value) -> Result<BpxCell, Vec<String>> {
     }
 }
 
-/// An object of the JSON with its path. If the object is missing, only the object is reported, not its keys.
+/// An object of the JSON with its path. The keys of a missing object are not reported as missing.
 struct Section<'a> {
     path: String,
     keys: Option<&'a Map<String, Value>>,
@@ -124,12 +113,12 @@ impl<'a> Section<'a> {
         self.keys?.get(key).filter(|value| !value.is_null())
     }
 
-    /// Returns an object below this one; it may be missing.
+    /// Returns a member that is an object and may be missing.
     fn optional(&self, key: &str) -> Self {
         Self { path: self.place(key), keys: self.get(key).and_then(Value::as_object) }
     }
 
-    /// Returns an object below this one. If the object is missing, adds a fault.
+    /// Returns a member that is an object, or adds a fault if it is missing.
     fn below(&self, key: &str, faults: &mut Vec<String>) -> Self {
         let below = self.optional(key);
         if self.keys.is_some() && below.keys.is_none() {
@@ -143,7 +132,6 @@ impl<'a> Section<'a> {
         Some(self.get(key)?.as_str()?.trim().to_owned()).filter(|text| !text.is_empty())
     }
 
-    /// Reads a number that may be missing.
     fn optional_number(&self, key: &str, (above, most): Above, faults: &mut Vec<String>) -> Option<f64> {
         let value = self.get(key)?;
         let number = value.as_f64().filter(|number| (*number > above) && *number <= most);
@@ -158,7 +146,7 @@ impl<'a> Section<'a> {
         number
     }
 
-    /// Reads a number. A missing or invalid number is reported, and the result is NaN.
+    /// Reads a number. If it is missing or invalid, adds a fault and returns NaN.
     fn number(&self, key: &str, range: Above, faults: &mut Vec<String>) -> f64 {
         self.require(key, "a number", faults);
         self.optional_number(key, range, faults).unwrap_or(f64::NAN)
@@ -170,9 +158,9 @@ impl<'a> Section<'a> {
         }
     }
 
-    /// Reads an activation energy, J/mol; `None` = not stated, or stated as 0.
+    /// Reads an activation energy (J/mol); `None` = not stated, or stated as 0.
     fn energy(&self, key: &str, faults: &mut Vec<String>) -> Option<f64> {
-        // The range includes 0.
+        // This range includes 0.
         self.optional_number(key, (-f64::MIN_POSITIVE, 1e6), faults).filter(|energy| *energy > 0.0)
     }
 
@@ -187,7 +175,7 @@ impl<'a> Section<'a> {
         self.optional_function(key, faults).unwrap_or(Function::Constant(f64::NAN))
     }
 
-    /// Reads the whole cell; `None` = the file is not BPX, or its version or model is not supported.
+    /// Reads the cell; `None` = the file is not BPX, or its version or model is not supported.
     fn cell(&self, faults: &mut Vec<String>) -> Option<BpxCell> {
         if self.keys.is_none() {
             faults.push("the file does not contain a JSON object, must be BPX".to_owned());
@@ -228,7 +216,6 @@ impl<'a> Section<'a> {
         Some(cell)
     }
 
-    /// Returns version and model from the header.
     fn kind(&self, faults: &mut Vec<String>) -> Option<(String, String)> {
         self.keys?;
         let version = match self.get("BPX") {
@@ -296,7 +283,6 @@ impl<'a> Section<'a> {
         }
     }
 
-    /// Reads electrolyte, layers and solids; `self` is the section `Parameterisation`.
     fn transport(&self, state: &Section<'_>, faults: &mut Vec<String>) -> Transport {
         let electrolyte = self.below("Electrolyte", faults);
         let separator = self.below("Separator", faults);
@@ -305,12 +291,12 @@ impl<'a> Section<'a> {
         let concentration = electrolyte
             .optional_number("Initial concentration [mol.m-3]", POSITIVE, faults)
             .or_else(|| initial.optional_number("Initial electrolyte concentration [mol.m-3]", POSITIVE, faults))
-            // 1 mol per litre, as in PyBaMM.
+            // 1 mol per litre is the value of PyBaMM.
             .unwrap_or(1000.0);
         let [conductivity, diffusivity] = ["Conductivity [S.m-1]", "Diffusivity [m2.s-1]"]
             .map(|key| electrolyte.value_at(key, concentration, faults));
         Transport {
-            // The thickness of an electrode is checked where the electrode is read.
+            // A wrong thickness of an electrode was already reported when the electrode was read.
             layers: [&negative, &separator, &positive].map(|layer| layer.layer(faults)),
             solid_s_per_m: [&negative, &positive].map(|solid| solid.number("Conductivity [S.m-1]", POSITIVE, faults)),
             concentration,
@@ -335,7 +321,7 @@ impl<'a> Section<'a> {
         }
     }
 
-    /// Returns the value of a function at `x`. The value must be positive.
+    /// Returns the positive value of a function at `x`.
     fn value_at(&self, key: &str, x: f64, faults: &mut Vec<String>) -> f64 {
         let before = faults.len();
         let value = self.function(key, faults).at(x);

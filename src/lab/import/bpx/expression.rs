@@ -1,12 +1,12 @@
-//! Parses and evaluates expressions of one variable `x` as in BPX files: a subset of Python's grammar, evaluated
-//! without Python.
+//! Parses and evaluates expressions of one variable `x` as in BPX files. They follow a subset of Python's grammar but
+//! are evaluated without Python.
 //!
-//! Input: a text with numbers, `x`, `+ - * / **`, signs, parentheses and the functions of [`FUNCTIONS`]. Output: a
-//! program for a stack machine. The program is evaluated with `libm`, so the same text gives the same values on every
+//! Input: a text with numbers, `x`, `+ - * / **`, signs, parentheses and the functions of [`FUNCTIONS`]. The text
+//! becomes a program for a stack machine, which uses `libm`, so that the same text gives the same values on every
 //! machine. As in Python, `**` is right-associative and binds more tightly than a sign before it (`-x**2` is
-//! `-(x**2)`). A fault states the column, what was found and what is allowed.
+//! `-(x**2)`).
 
-/// Maximum length of a text, bytes; the longest known expression of a potential has 500 bytes.
+/// Maximum length of a text (bytes). The longest known expression of a potential has 500 bytes.
 const MAX_BYTES: usize = 20_000;
 
 /// Maximum nesting of parentheses, functions, signs and powers. Deeper nesting would exhaust the stack of the parser.
@@ -14,7 +14,6 @@ const MAX_DEPTH: usize = 64;
 
 type Function = fn(f64) -> f64;
 
-/// The functions an expression may call.
 const FUNCTIONS: [(&str, Function); 13] = [
     ("exp", libm::exp),
     ("log", libm::log),
@@ -31,7 +30,6 @@ const FUNCTIONS: [(&str, Function); 13] = [
     ("abs", libm::fabs),
 ];
 
-/// One step of the program: pushes a value, or replaces the topmost values.
 #[derive(Debug, Clone, Copy)]
 enum Step {
     Number(f64),
@@ -45,7 +43,6 @@ enum Step {
     Call(Function),
 }
 
-/// A parsed expression of `x`.
 #[derive(Debug, Clone)]
 pub(super) struct Expression(Vec<Step>);
 
@@ -53,8 +50,7 @@ impl Expression {
     /// Parses a text.
     ///
     /// # Errors
-    /// The text is not a valid expression. The error states the column (from 1), what was found and what is
-    /// allowed.
+    /// The text is not a valid expression.
     pub(super) fn parse(text: &str) -> Result<Self, String> {
         if text.len() > MAX_BYTES {
             return Err(format!("has {} bytes, must be at most {MAX_BYTES}", text.len()));
@@ -87,7 +83,7 @@ impl Expression {
     }
 }
 
-/// Removes and returns the topmost value. A parsed program never does this with an empty stack.
+/// Removes and returns the topmost value. A parsed program never finds the stack empty.
 fn pop(stack: &mut Vec<f64>) -> f64 {
     stack.pop().unwrap_or(f64::NAN)
 }
@@ -115,13 +111,12 @@ impl Parser<'_> {
         &self.text[self.at..]
     }
 
-    /// Returns the next character that is not white space.
     fn peek(&mut self) -> Option<char> {
         self.at = self.text.len() - self.rest().trim_start().len();
         self.rest().chars().next()
     }
 
-    /// Consumes `token` if the text continues with it; returns whether it did.
+    /// If the text continues with `token`, consumes it and returns true.
     fn accept(&mut self, token: &str) -> bool {
         let is_next = self.peek().is_some() && self.rest().starts_with(token);
         if is_next {
@@ -135,7 +130,7 @@ impl Parser<'_> {
         format!("column {}: {found}, must be {allowed}", self.text[..self.at].chars().count() + 1)
     }
 
-    /// Returns the next name, or else the next character.
+    /// Returns the next name or, if there is none, the next character.
     fn word(&self) -> &str {
         let rest = self.rest();
         let is_name = |c: char| c.is_alphanumeric() || c == '_';
@@ -163,7 +158,6 @@ impl Parser<'_> {
         Ok(())
     }
 
-    /// Parses a power with the signs before it.
     fn signed(&mut self) -> Result<(), String> {
         self.depth += 1;
         if self.depth > MAX_DEPTH {

@@ -4,14 +4,13 @@ use serde_json::Value;
 
 use super::expression::Expression;
 
-/// Maximum number of points of a table; measured potentials have a few thousand.
+/// Maximum number of points of a table. Measured potentials have a few thousand.
 const MAX_POINTS: usize = 100_000;
 
-/// A fault: the path below the JSON value (empty, or starting with a dot), and a text with what was found and what is
+/// A fault: path below the JSON value (empty, or starting with a dot), and text with what was found and what is
 /// allowed.
 type Fault = (String, String);
 
-/// A function of stoichiometry or concentration.
 #[derive(Debug, Clone)]
 pub(super) enum Function {
     Constant(f64),
@@ -24,7 +23,7 @@ impl Function {
     /// Reads a JSON value.
     ///
     /// # Errors
-    /// The value is not a valid parameter. Each entry of the error is a fault with its path below the value.
+    /// The value is not a valid parameter. Each fault has its path below the value.
     pub(super) fn read(value: &Value) -> Result<Self, Vec<Fault>> {
         let fault = |text: String| vec![(String::new(), text)];
         match value {
@@ -38,7 +37,6 @@ impl Function {
         }
     }
 
-    /// Returns the value at `x`.
     pub(super) fn at(&self, x: f64) -> f64 {
         match self {
             Self::Constant(value) => *value,
@@ -57,7 +55,6 @@ impl Function {
     }
 }
 
-/// Formats a JSON value briefly for a message.
 pub(super) fn found(value: &Value) -> String {
     match value {
         Value::Null => "null".to_owned(),

@@ -1,4 +1,4 @@
-//! Writes the cell model of a BPX file. The output contains no date, so the same file gives the same bytes.
+//! Writes the cell model of a BPX file. The output contains no date, so that the same file gives the same bytes.
 
 use super::circuit::Resistances;
 use super::curve::Curve;
@@ -6,7 +6,6 @@ use super::document::BpxCell;
 use super::{BpxSettings, ERROR_OF_DROP, Model};
 use crate::fit::{quoted, toml_list as list, toml_table as table};
 
-/// Returns the text of the whole file.
 pub(super) fn text(
     settings: &BpxSettings,
     cell: &BpxCell,

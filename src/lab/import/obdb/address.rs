@@ -3,14 +3,16 @@
 //! | form of `hdr` | request | answer |
 //! | --- | --- | --- |
 //! | 3 digits | identifier of 11 bits: `hdr` | identifier `rax`; if `rax` is missing, `hdr` + 8 (as in ISO 15765-4), except for requests to all controllers (7DF) |
-//! | 3 digits, with `eax` | the first data byte is also `eax` | the first data byte is also `tst`; if `tst` is missing, the low byte of `hdr` (F1 for 6F1) |
-//! | 4 digits, `TTAA` | identifier of 29 bits: `pri` (default 18), `TT`, `AA`, `tst` (default F1) | a `rax` of 6 digits: identifier `pri`, `rax`; a shorter `rax`: identifier `pri`, DA, `tst`, last byte of `rax`; if `rax` is missing and `TT` is DA, `AA` (ISO 15765-2, normal fixed) |
+//! | 3 digits, with `eax` | also the first data byte `eax` | also the first data byte `tst`; if `tst` is missing, the low byte of `hdr` (F1 for 6F1) |
+//! | 4 digits, `TTAA` | identifier of 29 bits: `pri` (default 18), `TT`, `AA`, `tst` (default F1) | see below |
 //!
-//! Volvo and Polestar (`hdr` D0xx, `pri` 1D, without `rax`) have a form of their own: the answer to 1DD0xxyy is
-//! 1C000E80 + 2^13 xxyy. Recorded pairs: 1DD01630 and 1EC60E80, 1DD01635 and 1EC6AE80, 1DD01601 and 1EC02E80, 1DD01650
-//! and 1ECA0E80, 1DD01701 and 1EE02E80, 1DD01A01 and 1F402E80.
+//! The answer to a request with 4 digits depends on `rax`. If `rax` has 6 digits, the identifier is `pri`, `rax`. If
+//! `rax` is shorter, the identifier is `pri`, DA, `tst`, last byte of `rax`. If `rax` is missing and `TT` is DA, `AA`
+//! replaces the last byte of `rax` (ISO 15765-2, normal fixed).
 //!
-//! Any other form is rejected with the reason.
+//! Volvo and Polestar (`hdr` D0xx, `pri` 1D, without `rax`) use another rule: the answer to 1DD0xxyy is 1C000E80 + 2^13
+//! xxyy. Recorded pairs: 1DD01630 and 1EC60E80, 1DD01635 and 1EC6AE80, 1DD01601 and 1EC02E80, 1DD01650 and 1ECA0E80,
+//! 1DD01701 and 1EE02E80, 1DD01A01 and 1F402E80.
 
 use super::document::AddressDocument;
 use crate::can::CanId;
@@ -20,11 +22,10 @@ const FUNCTIONAL: u32 = 0x7DF;
 /// Value of `TT` in requests to one controller.
 const PHYSICAL: u32 = 0xDA;
 
-/// First two bytes of Volvo's requests.
+/// First byte and second byte of Volvo's requests.
 const VOLVO_PRIORITY: u32 = 0x1D;
 const VOLVO: u32 = 0xD0;
 
-/// CAN identifiers of one command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Addresses {
     pub(super) request: CanId,
@@ -34,7 +35,6 @@ pub(super) struct Addresses {
 }
 
 impl Addresses {
-    /// Converts an address; the error states what was found and what is allowed.
     pub(super) fn new(document: &AddressDocument) -> Result<Self, String> {
         if let Some(protocol) = document.proto.as_deref().filter(|name| !name.starts_with("15765-4")) {
             return Err(format!("proto is {protocol}, must be 15765-4 (CAN)"));
@@ -54,7 +54,7 @@ fn standard(document: &AddressDocument) -> Result<Addresses, String> {
         None if request == FUNCTIONAL => {
             return Err(format!("hdr is {} (all controllers) without rax, must be one controller", document.hdr));
         }
-        // ISO 15765-4 defines this difference of 8 for 7E0 to 7E7; other controllers of a car have it, too.
+        // ISO 15765-4 defines this difference of 8 for 7E0 to 7E7. Other controllers of a car use it too.
         None => request + 8,
     };
     let extension = match (byte("eax", document.eax.as_ref())?, byte("tst", document.tst.as_ref())?) {
@@ -77,7 +77,7 @@ fn extended(document: &AddressDocument) -> Result<Addresses, String> {
     let of_sender = |sender: u32| PHYSICAL << 16 | tester << 8 | sender & 0xFF;
     let response = match &document.rax {
         Some(rax) if rax.len() == 6 => hexadecimal("rax", rax)?,
-        // The last byte of shorter forms is the address of the controller.
+        // A shorter `rax` ends with the address of the controller.
         Some(rax) => of_sender(hexadecimal("rax", rax)?),
         None if middle >> 8 == PHYSICAL => of_sender(middle),
         None if middle >> 8 == VOLVO && priority == VOLVO_PRIORITY => {
@@ -97,7 +97,6 @@ fn extended(document: &AddressDocument) -> Result<Addresses, String> {
     Ok(Addresses { request, response, extension: None })
 }
 
-/// Reads a hexadecimal number of at most 24 bits.
 fn hexadecimal(field: &str, text: &str) -> Result<u32, String> {
     let number = u32::from_str_radix(text, 16).ok().filter(|number| *number <= 0xFF_FFFF && !text.starts_with('+'));
     number.ok_or_else(|| format!("{field} is \"{text}\", must be 1 to 6 hexadecimal digits"))

@@ -1,13 +1,12 @@
 //! Defines the JSON of an OBDb signal set (github.com/OBDb/.schemas, `signals.json`): the fields that the conversion
-//! uses, and known fields that it ignores. Each command and signal is read separately, so a faulty entry does not hide
-//! other entries.
+//! uses, and known fields that it ignores. Each command and each signal is read separately, so that a faulty entry does
+//! not hide other entries.
 
 use std::collections::BTreeMap;
 
 use serde::Deserialize;
 use serde_json::Value;
 
-/// A whole file.
 #[derive(Debug, Deserialize)]
 pub(super) struct SignalSetDocument {
     pub(super) commands: Vec<Value>,
@@ -19,7 +18,6 @@ pub(super) struct SignalSetDocument {
     pub(super) rest: BTreeMap<String, Value>,
 }
 
-/// One request and its answer.
 #[derive(Debug, Deserialize)]
 pub(super) struct CommandDocument {
     #[serde(flatten)]
@@ -37,17 +35,14 @@ pub(super) struct CommandDocument {
 /// Addresses as hexadecimal texts.
 #[derive(Debug, Default, Deserialize)]
 pub(super) struct AddressDocument {
-    /// 3 digits: 11-bit identifier; 4 digits: the middle of a 29-bit identifier.
+    /// 3 digits: 11-bit identifier. 4 digits: middle of a 29-bit identifier.
     pub(super) hdr: String,
-    /// Address of answers.
     pub(super) rax: Option<String>,
     /// Extended address: first data byte of requests.
     pub(super) eax: Option<String>,
     /// First byte of a 29-bit identifier.
     pub(super) pri: Option<String>,
-    /// Address of the tester.
     pub(super) tst: Option<String>,
-    /// Protocol.
     pub(super) proto: Option<String>,
 }
 
@@ -61,7 +56,6 @@ pub(super) struct YearFilter {
     years: Vec<i64>,
 }
 
-/// One signal.
 #[derive(Debug, Deserialize)]
 pub(super) struct SignalDocument {
     pub(super) id: String,
@@ -90,9 +84,9 @@ pub(super) struct FormatDocument {
     #[serde(default = "one")]
     pub(super) div: f64,
     pub(super) unit: Option<String>,
-    /// Values up to this value are not available.
+    /// Values up to this limit mean "not available".
     pub(super) nullmin: Option<f64>,
-    /// Values from this value on are not available.
+    /// Values from this limit on mean "not available".
     pub(super) nullmax: Option<f64>,
     pub(super) map: Option<Value>,
     #[serde(flatten)]
@@ -104,7 +98,6 @@ fn one() -> f64 {
 }
 
 impl YearFilter {
-    /// Whether the command exists in this model year.
     pub(super) fn contains(&self, year: i64) -> bool {
         let in_range = match (self.from, self.to) {
             (Some(from), Some(to)) if from <= to => (from..=to).contains(&year),

@@ -3,19 +3,19 @@
 //! * factor = `mul` / `div`, offset = `add`. As in OBDb's own decoder, `min` defaults to 0. OBDb's decoder clamps
 //!   values to `min` and `max`; here, a value outside this range is a bad reading. A signal without `max` is rejected.
 //!   If `max` is not above `min`, only the bits limit the range.
-//! * `nullmin`, `nullmax`: values at or outside these limits are not available. If only a few codes are affected, they
-//!   are listed; otherwise the allowed range ends before these limits.
+//! * `nullmin`, `nullmax`: values at or beyond these limits are not available. If only a few codes are affected, they
+//!   are listed. Otherwise, the allowed range ends before these limits.
 //! * All units are kept, including degrees Fahrenheit. Nothing is converted.
 
 use super::document::{FormatDocument, SignalDocument};
 use crate::import::{DiagnosticSignal, ExclusionReason};
 
-/// Maximum number of codes that are listed as "not available". Nobody reads a longer list.
+/// Maximum number of codes that are listed as "not available". A longer list is hard to read.
 const MAX_LISTED_CODES: usize = 8;
 /// Number of bits of the longest ISO-TP message with a 12-bit length.
 const MAX_BITS: i64 = 4095 * 8;
 
-/// Units: the name in OBDb, `=`, the symbol here. Numbers without a unit have an empty symbol.
+/// Units: OBDb's name, `=`, symbol. A number without a unit has an empty symbol.
 const UNITS: &str = "ampereHours=Ah amps=A bars=bar celsius=degC centimeters=cm coulombs=C degrees=deg fahrenheit=degF feet=ft \
     hertz=Hz hours=h joules=J kelvin=K kiloampereHours=kAh kiloamps=kA kilohertz=kHz kilojoules=kJ \
     kilometers=km kilometersPerHour=km/h kiloohms=kOhm kilopascal=kPa kilovolts=kV kilowattHours=kWh \
@@ -24,7 +24,6 @@ const UNITS: &str = "ampereHours=Ah amps=A bars=bar celsius=degC centimeters=cm 
     millimeters=mm milliohms=mOhm milliseconds=ms millivolts=mV milliwatts=mW minutes=min newtonMeters=Nm \
     normal= noyes= offon= ohms=Ohm percent=% radians=rad scalar= seconds=s unknown= volts=V watts=W yesno=";
 
-/// Why a signal is left out.
 type Fault = (ExclusionReason, String);
 
 /// Converts one signal. Its name is the whole `id`.
@@ -90,7 +89,6 @@ fn scaling(fmt: &FormatDocument) -> Result<(f64, f64), String> {
     Ok((factor, fmt.add))
 }
 
-/// Adds the allowed range and the codes that mean "not available".
 fn limit(signal: &mut DiagnosticSignal, fmt: &FormatDocument) -> Result<(), String> {
     let max = fmt.max.ok_or("max is missing, must be given for a number")?;
     let mut range = if max > fmt.min { (fmt.min, max) } else { signal.representable() };
@@ -113,7 +111,7 @@ fn limit(signal: &mut DiagnosticSignal, fmt: &FormatDocument) -> Result<(), Stri
     Ok(())
 }
 
-/// Returns the codes (bits of the signal) whose value is not available; `None` = there are too many.
+/// Returns the codes (bits of the signal) that mean "not available"; `None` = there are too many to list.
 fn listed_codes(signal: &DiagnosticSignal, is_null: impl Fn(f64) -> bool) -> Option<Vec<u64>> {
     let (low, high) = signal.codes();
     let value = |code: f64| code * signal.factor + signal.offset;

@@ -24,7 +24,7 @@ fn page_without_data_says_unknown_and_fetches_nothing() {
 }
 
 /// Creates the life of a pack of 96 cells: 600 half-cycles of three hours. Each cell fades at its own rate and has a
-/// voltage reading every two minutes. In every tenth half-cycle, an alarm of one cell is raised; in the following
+/// voltage reading every two minutes. In every tenth half-cycle, an alarm of one cell is raised. In the following
 /// half-cycle, an alarm of the next cell is cleared.
 fn life() -> Data {
     let mut data = Data::new(Origin::Replay);
@@ -53,7 +53,6 @@ fn moment_s(half: u16, minute: u16) -> f64 {
     1.7e9 + 10_800.0 * f64::from(half) + 60.0 * f64::from(minute)
 }
 
-/// Deterministic noise that does not repeat soon.
 fn noise(a: u16, b: u16) -> f64 {
     (f64::from(a) * 12.9898 + f64::from(b) * 78.233).sin()
 }
@@ -157,7 +156,7 @@ fn page_of_a_long_life_stays_below_five_megabytes() {
 fn menu_follows_the_order_of_the_page() {
     let page = page(&Data::new(Origin::Replay), &PageContext::default());
     let menu: Vec<&str> = page.split("<a href=\"#").skip(1).filter_map(|rest| rest.split('"').next()).collect();
-    // A heading, or the line of an empty section.
+    // Titles are headings and the lines of empty sections.
     let is_title = |tag: &&str| tag.starts_with("h2") || tag.starts_with("p class=\"none\" id");
     let titles = page.split('<').filter(is_title).filter_map(|rest| rest.split("id=\"").nth(1)?.split('"').next());
     assert_eq!(menu, titles.collect::<Vec<_>>());
@@ -173,15 +172,12 @@ fn pack_of_a_history_is_in_the_heading() {
 
 const PLUS_MINUS: char = '\u{b1}';
 
-/// A card of the page.
 struct Card<'a> {
     name: &'a str,
-    /// Value and note.
     text: String,
     doubt: Option<&'a str>,
 }
 
-/// Text between the first `from` and the next `to`.
 fn between<'a>(text: &'a str, from: &str, to: &str) -> Option<&'a str> {
     text.split_once(from)?.1.split(to).next()
 }
@@ -234,7 +230,7 @@ fn alarms_of_96_cells_are_one_problem() {
     assert_eq!(count.text, "96; in this record: capacity_low at 1 time");
 }
 
-/// Numbers after the plus-minus signs, each with half a unit of its last digit.
+/// Returns the numbers after the plus-minus signs, each with half a unit of its last digit.
 fn deviations(text: &str) -> Vec<(f64, f64)> {
     let number = |rest: &str| {
         let rest = rest.trim_start();
@@ -247,8 +243,7 @@ fn deviations(text: &str) -> Vec<(f64, f64)> {
     text.split(PLUS_MINUS).skip(1).map(number).collect()
 }
 
-/// Whether the numbers after the plus-minus signs of a text are these standard deviations, rounded to the printed
-/// digits.
+/// Whether the numbers after the plus-minus signs equal these standard deviations, rounded to the printed digits.
 fn states(text: &str, stds: &[f64]) -> bool {
     let printed = deviations(text);
     let is_same = |((value, half_digit), std): (&(f64, f64), &f64)| (value - std).abs() <= half_digit + 1e-9;
@@ -266,7 +261,7 @@ fn every_plus_minus_is_one_standard_deviation() {
     let page = page(&data, &context);
     assert!(page.contains(STATEMENT));
     let [first, second, third, last] = [0, 1, 2, 3].map(examples::stds);
-    // Standard deviations of the worst cell for each loss.
+    // Standard deviation of each loss, for the cell with the largest loss.
     let [lithium, negative, positive] = [second.losses[0], third.losses[1], first.losses[2]].map(|std| 100.0 * std);
     for card in cards(&page) {
         let expected = match card.name {

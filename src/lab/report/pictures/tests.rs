@@ -1,17 +1,15 @@
-//! Tests the time axis. The axis shows dates if the record has them. Otherwise, it shows the time since the start in a
-//! unit that suits the record's length.
+//! Tests the time axis. It shows dates if the record has them. Otherwise, it shows the time since the start in a unit
+//! that suits the record's length.
 
 use super::*;
 use crate::chart::Size;
 use crate::report::{examples, page};
 
-/// Texts of a picture that have this class, in order.
 fn texts<'a>(svg: &'a str, class: &str) -> Vec<&'a str> {
     let start = format!("class=\"{class}\">");
     svg.split(&start).skip(1).filter_map(|rest| rest.split('<').next()).collect()
 }
 
-/// Tick labels and caption of the x axis. In the picture, the caption follows the tick labels.
 fn x_axis(picture: &Picture) -> (Vec<String>, String) {
     let svg = picture.draw(Size::WIDE).0;
     let after_ticks = svg.rsplit("class=\"t m\">").next().expect("ticks");
@@ -19,7 +17,6 @@ fn x_axis(picture: &Picture) -> (Vec<String>, String) {
     (texts(&svg, "t m").into_iter().map(str::to_owned).collect(), caption.expect("a caption"))
 }
 
-/// Axes of all pictures of a recording of estimates.
 fn x_axes(data: &Data) -> Vec<(Vec<String>, String)> {
     let pictures = all(data, &PageContext::default());
     let names: Vec<&str> = pictures.iter().map(|(name, _)| name.as_str()).collect();

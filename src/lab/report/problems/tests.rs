@@ -1,4 +1,4 @@
-//! Tests the sentences of findings and alarms, and that both agree.
+//! Tests the sentences about findings and alarms.
 
 use super::*;
 use crate::cell_faults::imbalance::{CellSpread, LimitReason, LimitingCell};
@@ -16,7 +16,7 @@ fn found(kind: CellFaultKind, cell: u16, mean: f64, since_days: f64) -> CellFaul
     CellFault { kind, cells, since, reported: since, probability: 1.0, size }
 }
 
-/// A record of 27 days in which the contacts were first reported with the size `first`.
+/// Creates a record of 27 days in which the contacts were first reported with the size `first`.
 fn record(contacts: &[CellFault], first: f64) -> Data {
     let mut data = examples::recording(FIRST_S, 27.0 * DAY_S);
     for found in contacts {
@@ -67,7 +67,7 @@ fn contact_from_the_beginning_differs_from_one_that_grows() {
     assert_eq!(grown.condition, Condition::Plan);
     let late = [found(CellFaultKind::Contact, 9, 0.2, 15.0)];
     assert!(of(&late, 0.19).what.contains("comes loose"));
-    // A store has no earlier size.
+    // A store does not contain the first size.
     assert!(list(&contacts, &record(&[], 0.0))[0].what.ends_with("Whether the resistance grows is not known yet."));
 }
 
@@ -180,7 +180,7 @@ fn end_of_life_is_listed_unless_capacity_low_is_raised() {
 fn alarms_of_two_rules_are_two_problems() {
     let mut data = examples::worn(4);
     for cell in 0..4 {
-        // In the order in which the monitor learns: all alarms of one cell, then the next cell.
+        // The monitor raises all alarms of one cell before those of the next.
         for rule in ["capacity_low", "usable_capacity_low"] {
             data.alarms.push(AlarmRecord { threshold: Some(2.5), ..alarm(rule, "warning", Some(cell)) });
         }

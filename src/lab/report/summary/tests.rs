@@ -1,4 +1,4 @@
-//! Tests the first sentence, the figures and the gaps of the page.
+//! Tests the first sentence, the known figures and the unknown figures of the page.
 
 use super::*;
 use crate::cell::{Chemistry, Label};
@@ -133,7 +133,7 @@ fn label_is_the_reason_why_the_capacity_is_unknown() {
     assert_eq!(nmc.teaches, "A discharge and a charge of more than a quarter of the capacity.");
     let lfp = gap(Chemistry::LfpGraphite, &nothing);
     assert!(lfp.teaches.ends_with("nearly empty at one end and nearly full at the other."), "{lfp:?}");
-    // The same charges teach the capacity of the cells that were not measured.
+    // For cells that were not measured, the advice is the same.
     let mut one_of_two = Data::new(Origin::Replay);
     one_of_two.learned = vec![learned(1.71e9, 0, Some(1.2)), learned(1.71e9, 1, None)];
     let other = gap(Chemistry::Nmc811Graphite, &one_of_two);

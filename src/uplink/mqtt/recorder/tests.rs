@@ -44,8 +44,7 @@ fn schedule_restarts_after_pause_or_clock_step() {
     assert_eq!(sampled(10, &[1000.0, 1005.0, 100.0, 105.0, 110.0]), [1000.0, 100.0, 110.0]);
 }
 
-/// Numbers of the queued events in order, and -1 for a restart of the daemon; a negative number is a count of missed
-/// events times 1,000.
+/// Numbers of the queued events in order. -1 stands for a restart of the daemon, -1000 N for N missed events.
 fn queued(queue: &Queue) -> Vec<i64> {
     let number = |body: &str| {
         let event: Value = serde_json::from_str(body).unwrap();
@@ -70,12 +69,12 @@ fn with_events(started: i64, first: i64, last: i64) -> StatusDocument {
 #[test]
 fn each_event_is_queued_once_or_counted() {
     for (documents, events, missed) in [
-        // First start: events that left the list earlier are not counted.
+        // On the first start, events that are no longer listed are not counted.
         (&[(1, 5, 9)][..], &[5, 6, 7, 8, 9][..], 0),
         (&[(1, 1, 0), (1, 1, 2), (1, 1, 2), (1, 2, 4)], &[1, 2, 3, 4], 0),
         (&[(1, 1, 2), (1, 67, 98)], &[&[1, 2, -64_000][..], &(67..=98).collect::<Vec<_>>()].concat(), 64),
         (&[(1, 1, 2), (1, 6, 7), (1, 9, 9)], &[1, 2, -3000, 6, 7, -1000, 9], 4),
-        // The daemon restarts, also with a smaller and with a higher number.
+        // The daemon restarts, with a smaller or a higher event number.
         (&[(1, 1, 3), (2, 1, 1)], &[1, 2, 3, -1, 1], 0),
         (&[(1, 1, 3), (2, 3, 4)], &[1, 2, 3, -1, -2000, 3, 4], 2),
     ] {

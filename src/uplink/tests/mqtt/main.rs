@@ -1,5 +1,5 @@
-//! Runs `packwatch-uplink mqtt` as a user does: the program, a real broker (Debian's mosquitto) on a loopback port, a
-//! reader (mosquitto_sub) with its own session, and a status socket fed by the test.
+//! Runs `packwatch-uplink mqtt` as a user does: the real program, a real broker (Debian's mosquitto) on a loopback
+//! port, and a reader (mosquitto_sub) with its own session. The test sends the documents through a status socket.
 
 mod rig;
 
@@ -100,8 +100,8 @@ fn hour_without_broker_and_two_power_cuts_lose_nothing() {
     let mut latest = (0, 0);
     for sample in &samples {
         let now = (sample["sequence"].as_i64().unwrap(), rig::second_of(sample));
-        // Every sample arrives at least once and none is skipped: each message carries the next sample, or repeats an
-        // earlier one.
+        // Every sample arrives at least once, and no sample is skipped. Each message has the next sample, or repeats an
+        // earlier sample.
         assert!(now.1 <= latest.1 + 1, "after second {} came {}", latest.1, now.1);
         latest = latest.max(now);
     }

@@ -76,7 +76,6 @@ impl Broker {
         broker
     }
 
-    /// Restarts the broker with its stored state.
     pub(crate) fn restart(&mut self) {
         let log = fs::File::options().create(true).append(true).open(self.folder.path().join("log")).unwrap();
         let mut command = Command::new("mosquitto");
@@ -106,7 +105,6 @@ fn signal(process: &Child, name: &str) {
     Command::new("kill").arg(format!("-{name}")).arg(process.id().to_string()).status().unwrap();
 }
 
-/// The daemon's status socket.
 pub(crate) struct Daemon {
     folder: TempDir,
     listener: UnixListener,
@@ -143,7 +141,6 @@ impl Daemon {
     }
 }
 
-/// The program under test.
 pub(crate) struct Uplink {
     folder: Arc<TempDir>,
     process: Child,
@@ -243,7 +240,6 @@ pub(crate) struct Reader {
 }
 
 impl Reader {
-    /// Subscribes, and waits for the broker's confirmation.
     pub(crate) fn start(broker: &Broker, topics: &[&str]) -> Self {
         let mut command = Command::new("stdbuf");
         command.args([

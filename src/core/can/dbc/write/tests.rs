@@ -52,7 +52,7 @@ fn quotes_in_text_are_escaped() {
     assert_eq!(Database::parse(&read.to_dbc()).unwrap(), read);
 }
 
-/// Text without quotes and backslashes, because writing would change them.
+/// Text without quotation marks and backslashes, because writing changes these characters.
 const TEXT: &str = "[ -!#-\\[\\]-~\u{b0}\u{b5}\u{20ac}]{0,12}";
 
 fn layouts() -> impl Strategy<Value = SignalLayout> {
@@ -70,14 +70,13 @@ fn layouts() -> impl Strategy<Value = SignalLayout> {
         |(start_bit, length_bits, byte_order, value_type, [factor, offset, minimum, maximum])| {
             let layout =
                 SignalLayout { start_bit, length_bits, byte_order, value_type, factor, offset, minimum, maximum };
-            // A range that states the size of both ends is read as the range that it means.
+            // The parser replaces the minimum of a range that states only magnitudes. Do the same here.
             SignalLayout { minimum: lowest(&layout), ..layout }
         },
     )
 }
 
 prop_compose! {
-    /// A signal that is always present.
     fn signals()(
         layout in layouts(),
         unit in TEXT,
@@ -90,8 +89,7 @@ prop_compose! {
     }
 }
 
-/// How a signal depends on an earlier signal: the multiplexor and its codes, and whether the signal itself is a
-/// multiplexor.
+/// The condition of a signal (an earlier multiplexor and ranges of its code), and whether the signal is a multiplexor.
 type MuxLink = (Option<(prop::sample::Index, Vec<(u64, u64)>)>, bool);
 
 fn mux_links() -> impl Strategy<Value = MuxLink> {
@@ -101,7 +99,7 @@ fn mux_links() -> impl Strategy<Value = MuxLink> {
     (condition, any::<bool>())
 }
 
-/// Gives the signals names and conditions. The nesting stays below the depth that the parser rejects as a loop.
+/// The nesting stays below the parser's limit.
 fn assemble(parts: Vec<(Signal, MuxLink)>) -> Vec<Signal> {
     let mut made: Vec<Signal> = Vec::new();
     for (number, (mut signal, (condition, is_multiplexor))) in parts.into_iter().enumerate() {

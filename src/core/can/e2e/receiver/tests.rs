@@ -1,4 +1,4 @@
-//! Tests every pair of state and event, and realistic sequences of frames.
+//! Tests every pair of receiver state and input, and realistic sequences of frames.
 
 #![allow(clippy::unwrap_used, reason = "tests may panic")]
 
@@ -6,10 +6,10 @@ use super::*;
 
 const LAST: u8 = 7;
 
-/// Classes of receiver states; LastValidCounter is 7 in all classes except the first.
+/// Classes of receiver states. LastValidCounter is 7, except in `Waiting`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum State {
-    /// WaitForFirstData.
+    /// No frame was accepted yet.
     Waiting,
     /// The last frame was valid. The next call allows a step of 2.
     Following,
@@ -82,8 +82,8 @@ fn apply(receiver: &mut Receiver, config: &CheckConfig, what: Input) -> Status {
     receiver.check(config, &frame(config, counter))
 }
 
-/// For profile 1, a frame with an invalid counter and a correct CRC. For profile 5, where 15 is a valid counter, a
-/// frame of another message.
+/// A frame with counter 15. In profile 1, the counter is invalid and the CRC is correct. In profile 5, where 15 is a
+/// valid counter, the frame belongs to another message.
 fn counter_15(config: &CheckConfig) -> [u8; 8] {
     let mut payload = frame(config, 14);
     let other = Protection { data_id: 0x0456, ..config.protection };
@@ -97,8 +97,8 @@ fn counter_15(config: &CheckConfig) -> [u8; 8] {
     payload
 }
 
-/// Expected status of AUTOSAR's check, followed by the expected (LastValidCounter, MaxDeltaCounter,
-/// NoNewOrRepeatedDataCounter, SyncCounter). `sync` is SyncCounterInit.
+/// Expected result of AUTOSAR's check: the status, then LastValidCounter, MaxDeltaCounter, NoNewOrRepeatedDataCounter
+/// and SyncCounter. `sync` is SyncCounterInit.
 fn wanted(profile: Profile, state: State, what: Input, sync: u8) -> (Status, (Option<u8>, u8, u8, u8)) {
     use Input::{Damaged, Invalid15, Next, NoFrame, OneLost, Same, Short, TooFar};
     use State::{Following, Silent, Syncing, Waiting};
@@ -106,7 +106,7 @@ fn wanted(profile: Profile, state: State, what: Input, sync: u8) -> (Status, (Op
     let (last, grown) = (before.last_valid, before.max_delta + 1);
     let (repeated, syncing) = (before.no_new_or_repeated, before.sync);
     let at = |step: u8| Some(LAST + step);
-    // After too long a silence, synchronisation is required. This frame is the first frame of the synchronisation.
+    // After too long a silence, synchronisation is required and starts with this frame.
     let left = sync.saturating_sub(1);
     let after_silence = |normal| if sync > 0 { Status::Sync } else { normal };
     match (state, what) {
@@ -165,7 +165,7 @@ fn lost_frames_are_accepted_up_to_allowed_step() {
 fn profile_1_without_sync_waits_for_sender_counter() {
     let config = config(Profile::P01A, 0);
     let mut receiver = in_state(State::Following);
-    // The sender is 6 ahead and advances by 1 per frame, as fast as the allowed step grows.
+    // The sender is 6 ahead. Its counter grows by 1 per frame, as fast as the allowed step.
     let statuses: Vec<_> = (0..11).map(|n| receiver.check(&config, &frame(&config, (LAST + 6 + n) % 15))).collect();
     assert!(statuses[..9].iter().all(|status| *status == Status::WrongSequence), "{statuses:?}");
     assert_eq!(statuses[9..], [Status::Repeated, Status::Ok]);

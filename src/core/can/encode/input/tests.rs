@@ -8,14 +8,13 @@ use proptest::prelude::*;
 
 type Values = Vec<(Channel, Option<f64>)>;
 
-/// Returns the frames that carry `values`, and the number of values that no frame carries.
+/// Returns the frames and the number of values that no frame carries.
 fn encode(map: &InputMap, values: &[(Channel, Option<f64>)]) -> (Vec<Frame>, usize) {
     let mut frames = Vec::new();
     let lost = InputEncoder::new(map).encode(values, &mut frames);
     (frames.into_iter().map(|(_, frame)| frame).collect(), lost)
 }
 
-/// Decodes the frames that carry `values`.
 fn round_trip(map: &InputMap, values: &[(Channel, Option<f64>)]) -> Vec<(Channel, Result<f64, Fault>)> {
     encode(map, values).0.iter().flat_map(|frame| readings(map, 0, frame)).collect()
 }
@@ -28,7 +27,7 @@ fn near(found: Result<f64, Fault>, wanted: f64, within: f64) -> bool {
 fn direction_and_magnitude_encode_signed_current() {
     let direction = |name| Binding { charge: vec![1.0], ..bind(name, Channel::CurrentDirection) };
     let magnitude = bind("Pack.Voltage", Channel::Current);
-    // The direction is in the message of the magnitude, or in a later message.
+    // The direction is in the magnitude's message or in a later message.
     for direction in [Binding { offset: 40.0, ..direction("Pack.Temperature") }, direction("Nested.Always")] {
         let map = InputMap::new(vec![direction, magnitude.clone()]);
         for current_a in [12.3, -12.3, 0.0] {
@@ -58,7 +57,7 @@ fn messages_and_pages_decode_to_encoded_values() {
     let found = round_trip(&map(), &values);
     for (channel, wanted) in &values {
         let readings: Vec<_> = found.iter().filter(|(name, _)| name == channel).collect();
-        // The temperature is always present, so it is on both pages.
+        // The temperature is on both pages.
         assert_eq!(readings.len(), if *channel == sensor(1) { 2 } else { 1 }, "{channel:?}");
         assert!(readings.iter().all(|(_, value)| near(*value, wanted.unwrap(), 1e-9)), "{channel:?}: {readings:?}");
     }
@@ -109,8 +108,7 @@ fn missing_value_without_code_is_encoded_as_invalid() {
 
 #[test]
 fn frame_without_code_for_missing_is_omitted_and_counted() {
-    // The signal of the third cell has no code for a missing value, because each of its codes is a valid voltage. If
-    // this voltage is missing, the page with the third cell cannot be sent. The other page can be sent.
+    // Each code of the third cell's signal is a valid voltage. If this voltage is missing, its page cannot be sent.
     let (frames, lost) = encode(&map(), &[(sensor(1), Some(1.0))]);
     assert_eq!((frames.len(), lost), (1, 0));
     let two = InputMap::new(vec![bind("Cells.Cell3", cell(2)), bind("Cells.Air", sensor(1))]);

@@ -1,5 +1,5 @@
-//! Tests that valid settings change the layout and that invalid settings are rejected with their key. Also tests that a
-//! layout built from its own text does not change.
+//! Tests that valid settings change the layout, that invalid settings are rejected with their key, and that a layout
+//! rebuilt from its own text does not change.
 
 use super::*;
 use crate::can::encode::{CommandPlan, OutputPlan};
@@ -18,8 +18,7 @@ fn with_status(status: MessageSettings) -> LayoutSettings {
     LayoutSettings { status, ..Default::default() }
 }
 
-/// Replaces a text in the shipped DBC and uses the result as the user's own DBC. Returns the key and the text of the
-/// only fault.
+/// Uses the shipped DBC with a replaced text as the user's own DBC. Returns key and text of the only fault.
 fn own_fault(from: &str, to: &str, status: MessageSettings) -> (&'static str, String) {
     assert!(TEXT.contains(from), "{from}");
     let own = Database::parse(&TEXT.replace(from, to)).unwrap();
@@ -278,7 +277,7 @@ fn authenticated_message_has_trailer_signals() {
         assert_eq!(lens, [24, 20, len_bytes, 8], "{profile:?}");
         let plan = CommandPlan::new(&made).unwrap();
         assert_eq!((plan.authentication(), plan.protection()), (command.secoc, None));
-        // The trailer signals must be at the position at which the trailer is written.
+        // The trailer must be written where the trailer signals are.
         let command = made.message("PACKWATCH_Command").unwrap();
         let mut payload = vec![0; usize::from(len_bytes)];
         let authentication = Authentication { profile, data_id: 4 };

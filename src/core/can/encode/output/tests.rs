@@ -45,7 +45,7 @@ fn assert_decodes(name: &str, frame: &Frame, wanted: f64) {
     assert!(found.is_ok_and(|found| (found - wanted).abs() <= half), "{name}: {found:?} for {wanted}");
 }
 
-/// Asserts that a signal has its "not available" code and that this code is outside the signal's range.
+/// Asserts that a signal has its "not available" code, and that the code is out of range.
 fn assert_not_available(name: &str, frame: &Frame) {
     let dbc = default_database().unwrap();
     let codes = dbc.signal(&format!("PACKWATCH_{name}")).unwrap().1.not_available_codes();
@@ -55,7 +55,6 @@ fn assert_not_available(name: &str, frame: &Frame) {
     assert!(value == Err(Fault::OutOfRange) || name == "Alarm.Severity", "{name} reads {value:?}");
 }
 
-/// Faults of the shipped DBC after one text was replaced.
 fn faults(from: &str, to: &str) -> Vec<String> {
     assert!(TEXT.contains(from), "{from}");
     let dbc = Database::parse(&TEXT.replace(from, to)).unwrap();
@@ -103,7 +102,7 @@ fn status_decodes_within_half_a_bit() {
     }
 }
 
-/// For each field of the health frame: its page, its name, a value in internal units, and the decoded value.
+/// Page, name, value in internal units, and decoded value.
 const HEALTH_VALUES: [(usize, &str, f64, f64); 36] = [
     (0, "Capacity", 2.6, 2.6),
     (0, "CapacityStd", 0.0213, 0.0213),
@@ -150,7 +149,7 @@ fn health_fields(of: impl Fn(usize) -> Option<f64>) -> HealthFields {
             let place = OUTLOOK.iter().position(|(_, other, of)| (other, *of) == (quantity, part));
             place.and_then(|place| of(HEALTH.len() + place))
         });
-        // A standard deviation has a mean.
+        // An estimate with a standard deviation also needs a mean.
         outlook.set(*quantity, mean.or(std).map(|known| Estimate { mean: mean.unwrap_or(known), std }));
     }
     HealthFields {
@@ -285,8 +284,7 @@ fn extremes_saturate_and_never_become_not_available() {
 
 #[test]
 fn every_rule_has_its_own_value_and_threshold() {
-    // Each value in internal units and as decoded. For example, the share of bad readings is a fraction internally and
-    // % on the wire.
+    // Each value in internal units and as decoded. A fraction is decoded as %.
     let values: [(f64, f64); RULES.len()] = [
         (1.4, 1.4),
         (1.38, 1.38),
@@ -368,7 +366,7 @@ fn every_filled_signal_is_required() {
         let (message, signal) = name.split_once('.').unwrap();
         let message = dbc.messages.iter_mut().find(|m| m.name.ends_with(message)).unwrap();
         let position = message.signals.iter().position(|s| s.name == signal).unwrap();
-        // The signal is renamed and not removed, because conditions refer to signals by index.
+        // Rename the signal instead of removing it, because conditions refer to signals by index.
         message.signals[position].name = "Other".to_owned();
         let found = OutputPlan::new(&dbc).unwrap_err();
         assert_eq!(found.0, [format!("signal PACKWATCH_{name} is missing")]);

@@ -47,7 +47,6 @@ impl Message {
     }
 }
 
-/// A node, its bus, and the received messages.
 struct Bench {
     node: Node,
     now_ms: i64,
@@ -55,7 +54,7 @@ struct Bench {
     frames: Vec<(i64, Frame)>,
     events: Vec<NodeEvent>,
     messages: Vec<Message>,
-    /// Announced transfer: group, number of bytes, bytes received so far.
+    /// Group, number of bytes, bytes received so far.
     transfer: Option<(u32, usize, Vec<u8>)>,
 }
 
@@ -72,7 +71,7 @@ impl Bench {
         }
     }
 
-    /// Starts at -50 ms, so that the address is claimed at 250 ms.
+    /// Starts the node. The address is claimed 300 ms later, at 250 ms.
     fn start(&mut self) {
         self.now_ms = -50;
         self.node.start(at(-50), &mut self.out);
@@ -147,7 +146,7 @@ impl Bench {
         self.messages.push(Message { ms: self.now_ms, pgn, data });
     }
 
-    /// For each message of a group: the time at which the message was complete (ms), and its codes.
+    /// Time (ms) at which each message was complete, and its codes.
     fn received(&self, pgn: u32) -> Vec<(i64, Vec<u32>)> {
         self.messages.iter().filter(|m| m.pgn == pgn).map(|m| (m.ms, m.codes())).collect()
     }

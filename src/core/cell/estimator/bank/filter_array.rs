@@ -1,7 +1,7 @@
-//! Stores the filters of a pack in blocks of [`WIDTH`] lanes, one cell per lane, and computes the steps of a batch. The
-//! number of the model's branches is a parameter of the types.
+//! Stores the filters of a pack in blocks of [`WIDTH`] lanes, one cell per lane, and computes the steps of a batch.
 //!
-//! In: inputs of the blocks. Out: changed states, and results. Steps that are not ordinary are added to `others`.
+//! In: inputs of the blocks. Out: changed states, and results. If a result is not usable, the step is added to
+//! `others`.
 
 use std::array::from_fn;
 
@@ -16,12 +16,11 @@ use crate::cell::estimator::step::{CellStep, StepResult, Update};
 use crate::cell::model::CellModel;
 use crate::filter::simd::Lanes;
 
-/// Filters with N states, T covariance elements and tables of W columns.
 #[derive(Debug, Clone)]
 pub(super) struct FilterArray<const N: usize, const T: usize, const W: usize> {
     tables: Tables<W>,
     pub(super) blocks: Vec<FilterState<WIDTH, N, T>>,
-    /// Per block: the cache for steps of all its cells together, and the caches for steps of single cells.
+    /// Per block: one cache for steps of the whole block, and one cache per cell for steps of single cells.
     cache: Vec<(LineCache<WIDTH, W>, [LineCache<1, W>; WIDTH])>,
     step_time: StepTime,
 }
@@ -34,7 +33,6 @@ pub(super) enum FilterArrays {
     Three(FilterArray<6, 21, 24>),
 }
 
-/// Evaluates an expression for the array with the pack's number of branches.
 macro_rules! each_array {
     ($filters:expr, $x:ident => $body:expr) => {
         match $filters {
@@ -46,7 +44,7 @@ macro_rules! each_array {
 }
 pub(super) use each_array;
 
-/// The last step time (s) with its decay factors. Most readings arrive at the same interval, so the factors can be
+/// The last step time (s) with its decay factors. Most readings arrive at equal intervals, so the factors can be
 /// reused.
 #[derive(Debug, Clone)]
 struct StepTime {
@@ -66,7 +64,7 @@ impl StepTime {
     }
 }
 
-/// The steps of a batch, to be compiled for the widest instructions of the machine.
+/// The steps of a batch, compiled for the widest vector instructions of the machine.
 pub(super) struct BatchStep<'a, const N: usize, const T: usize, const W: usize> {
     pub(super) lanes: &'a mut FilterArray<N, T, W>,
     pub(super) constants: &'a KernelConstants,
@@ -87,14 +85,12 @@ impl<const N: usize, const T: usize, const W: usize> pulp::WithSimd for BatchSte
 }
 
 impl<const N: usize, const T: usize, const W: usize> BatchStep<'_, N, T, W> {
-    /// Computes the steps. Without wide instructions, the same kernel steps the lanes one by one and gives the same
-    /// bits.
+    /// Computes the steps. Without wide instructions, the kernel steps the lanes one by one and gives the same bits.
     #[inline(always)]
     pub(super) fn run<const WIDE: bool>(self) {
         self.lanes.step::<WIDE>(self.constants, self.inputs, self.cells, self.results);
         for (block, input) in self.inputs.iter_mut().enumerate().filter(|(_, input)| input.is_present.any()) {
-            // The input was ordinary, but the outcome was not usable: the step is computed again as a step that is not
-            // ordinary.
+            // The outcome was not usable, so the bank computes the step again as a step that is not ordinary.
             for lane in 0..WIDTH {
                 if input.is_present.lane(lane) {
                     input.is_present.set_lane(lane, false);
@@ -108,7 +104,7 @@ impl<const N: usize, const T: usize, const W: usize> BatchStep<'_, N, T, W> {
 impl<const N: usize, const T: usize, const W: usize> FilterArray<N, T, W> {
     pub(super) fn new(model: &CellModel, blocks: usize) -> Self {
         let zero = Lanes::splat(0.0);
-        // The kernel may step every lane, so lanes without a cell need valid states too.
+        // The kernel may step every lane, so lanes without a cell need valid states, too.
         let mut covariance = [zero; T];
         (0..N).for_each(|i| covariance[at(i, i)] = Lanes::splat(1.0));
         let mut mean = [zero; N];
@@ -124,7 +120,7 @@ impl<const N: usize, const T: usize, const W: usize> FilterArray<N, T, W> {
         }
     }
 
-    /// Steps every block that has inputs. Clears `is_present` of each cell whose step was computed.
+    /// Steps every block that has inputs. Clears `is_present` of each cell with a usable outcome.
     #[inline(always)]
     fn step<const WIDE: bool>(
         &mut self,
@@ -167,8 +163,8 @@ impl<const N: usize, const T: usize, const W: usize> FilterArray<N, T, W> {
         }
     }
 
-    /// Indices of the cells with the lowest and with the highest SOC. If several cells have the same SOC, the first of
-    /// them is returned.
+    /// Indices of the cells with the lowest and with the highest SOC. If several cells have the same SOC, returns the
+    /// first.
     pub(super) fn extremes(&self, cells: usize) -> Option<(usize, usize)> {
         let all = self.blocks.iter().flat_map(|state| state.mean[0].0).take(cells).enumerate();
         let first = all.clone().next()?;
@@ -178,7 +174,6 @@ impl<const N: usize, const T: usize, const W: usize> FilterArray<N, T, W> {
         Some((ends.0.0, ends.1.0))
     }
 
-    /// The state and the memory in a lane.
     pub(super) fn lane(&self, cell: usize) -> (Gaussian, HotMemory) {
         let state = FilterState::of_lane(&self.blocks[cell / WIDTH], cell % WIDTH);
         (state.gaussian(), state.memory)
@@ -187,7 +182,7 @@ impl<const N: usize, const T: usize, const W: usize> FilterArray<N, T, W> {
     /// Replaces state and memory of a lane; returns whether the cell has a filter.
     pub(super) fn set(&mut self, cell: usize, filter: Option<&Gaussian>, hot: HotMemory) -> bool {
         let (block, lane) = (&mut self.blocks[cell / WIDTH], cell % WIDTH);
-        // The filter has as many branches as the model, because states are checked when they are restored.
+        // The number of branches fits, because states are checked when they are restored.
         let Some(filter) = filter.filter(|filter| filter.states == N) else {
             block.memory.iter_mut().zip(hot).for_each(|(all, one)| all.0[lane] = one.0[0]);
             return false;
@@ -196,8 +191,8 @@ impl<const N: usize, const T: usize, const W: usize> FilterArray<N, T, W> {
         true
     }
 
-    /// Predicts the state `x` of a cell; the cell's lane is neither read nor changed. If the prediction cannot be
-    /// computed, returns `None` and leaves `x` unchanged.
+    /// Predicts the state `x` of a cell; the cell's lane is neither read nor changed. If the prediction fails, returns
+    /// `None` and leaves `x` unchanged.
     #[inline(never)]
     pub(super) fn predict(
         &mut self,
@@ -213,9 +208,9 @@ impl<const N: usize, const T: usize, const W: usize> FilterArray<N, T, W> {
         (has_factor & has_variances(&new, Lanes([0.0]))).all().then(|| *x = new.gaussian())
     }
 
-    /// Updates the state `x` of a cell with a voltage; the cell's lane is neither read nor changed. A voltage beyond
-    /// the gate does not change `x`. Also returns the memory with the new evidence. If the update cannot be computed,
-    /// returns `None` and leaves `x` unchanged.
+    /// Updates the state `x` of a cell with a voltage; the cell's lane is neither read nor changed. Also returns the
+    /// memory with the new evidence. A voltage beyond the gate does not change `x`. If the update fails, returns `None`
+    /// and leaves `x` unchanged.
     #[inline(never)]
     pub(super) fn update(
         &mut self,
@@ -241,8 +236,7 @@ impl<const N: usize, const T: usize, const W: usize> FilterArray<N, T, W> {
         Some((outcome.lane(0), state.memory))
     }
 
-    /// Returns the tables and the cell's own cache, after updating both to the cell's temperature and to the capacity
-    /// of its open-circuit curve.
+    /// Updates the tables and the cell's cache to the cell's temperature and capacity, and returns both.
     fn own_tables(
         &mut self,
         cell: usize,
@@ -256,7 +250,7 @@ impl<const N: usize, const T: usize, const W: usize> FilterArray<N, T, W> {
     }
 }
 
-/// Steps one cell of a block. It is not inlined into the vector code, so one copy serves all instruction widths.
+/// Steps one cell of a block. It is not inlined into the vector code, so that one copy serves all instruction widths.
 #[inline(never)]
 fn step_alone<const N: usize, const T: usize, const W: usize>(
     tables: &mut Tables<W>,

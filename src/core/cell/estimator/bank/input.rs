@@ -1,28 +1,29 @@
-//! Inputs of the cells of a block, and the results of their steps.
+//! Collects the inputs of a block of cells, and records the results of their steps. Each cell has one lane of the
+//! block.
 //!
-//! In: steps, lane by lane (V, A, s, degrees C). Out: the kernel's inputs; if an outcome is not usable, the
-//! step to compute again.
+//! In: steps (V, A, s, degrees C). Out: the inputs of the kernel. If the outcome of a step is not usable,
+//! [`BlockInput::step`] returns the step, so that it can be computed again.
 
 use super::kernel::{DecayFactors, StepInput, StepOutcome};
 use crate::cell::estimator::memory::Memory;
 use crate::cell::estimator::step::{CellStep, StepResult, Update};
 use crate::filter::simd::{Lanes, Mask};
 
-/// Number of cells in a block: one AVX-512 vector or two AVX2 vectors (blocks of 4 and 16 cells were slower in
-/// measurements).
+/// Number of cells in a block: one AVX-512 vector or two AVX2 vectors. Blocks of 4 and of 16 cells were slower in
+/// measurements.
 pub(super) const WIDTH: usize = 8;
 
-/// State of a cell in addition to the state in its lane.
+/// Data of a cell, in addition to the data in its lane.
 #[derive(Debug, Clone)]
 pub(super) struct CellSlot {
-    /// Memory of the cell. The present values of load, consistency, information, rest and evidence are in the lane; the
-    /// values here are out of date.
+    /// Load, consistency, information, rest and evidence in this memory are out of date. Their present values are in
+    /// the lane.
     pub(super) memory: Memory,
     pub(super) has_filter: bool,
 }
 
 impl CellSlot {
-    /// Whether a step with a continuously measured current can be ordinary.
+    /// Whether a step with a continuously measured current can be ordinary (see [`super`]).
     #[inline]
     pub(super) fn is_ordinary(&self) -> bool {
         self.has_filter
@@ -34,7 +35,6 @@ impl CellSlot {
 }
 
 impl<const L: usize> StepOutcome<L> {
-    /// The outcome of a lane.
     #[inline(always)]
     pub(super) fn lane(&self, lane: usize) -> Update {
         Update {
@@ -46,7 +46,6 @@ impl<const L: usize> StepOutcome<L> {
     }
 }
 
-/// The inputs of a block's cells.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct BlockInput {
     pub(super) is_present: Mask<WIDTH>,
@@ -67,8 +66,8 @@ impl BlockInput {
         },
     };
 
-    /// Gives each lane without a step the step time of a lane with a step, so that the same decay factors serve all
-    /// lanes. The results of lanes without a step are discarded.
+    /// Gives each lane without a step the time of a lane with a step, so that all lanes can share the decay factors.
+    /// The results of lanes without a step are discarded.
     #[inline(always)]
     pub(super) fn fill_absent(&mut self) {
         if !self.is_present.all() {
@@ -78,7 +77,6 @@ impl BlockInput {
         }
     }
 
-    /// The step that the inputs of a lane describe.
     pub(super) fn step(&self, lane: usize) -> CellStep {
         let input = &self.input;
         CellStep {
@@ -88,7 +86,7 @@ impl BlockInput {
             unmeasured_s: 0.0,
             current_a: Some(input.current_a.0[lane]),
             temperature_c: Some(input.temperature_c.0[lane]),
-            // Unused, because the step has a temperature.
+            // Not used, because the step has a temperature.
             ambient_c: input.temperature_c.0[lane],
             voltage_v: input.voltage_v.0[lane],
             is_voltage_frozen: false,
@@ -111,7 +109,7 @@ impl StepInput<WIDTH> {
         }
     }
 
-    /// Records the outcome of the step in lane `lane`. The outcome is in lane `from` of `outcome`.
+    /// Records the outcome of the step of lane `lane`, which is in lane `from` of `outcome`.
     #[inline(always)]
     pub(super) fn note<const L: usize>(
         &self,

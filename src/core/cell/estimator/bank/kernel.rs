@@ -1,7 +1,8 @@
-//! The ordinary step of L cells at once: predict over a measured time, update with a voltage that passes the gate.
+//! Computes ordinary steps (see [`super`]) of L cells at once: a prediction over a measured time, and an update with a
+//! voltage within the gate.
 //!
-//! Computes the filter of [`estimator`](crate::cell::estimator) with the circuit of [`crate::cell::circuit`]. The
-//! results agree with the textbook form up to rounding. The following exact rearrangements save work:
+//! The filter is described in [`estimator`](crate::cell::estimator), the circuit in [`crate::cell::circuit`]. The
+//! results agree with the textbook form up to rounding. These exact rearrangements save work:
 //! * Sigma points come in pairs x +- s L_k with s = sqrt(N + lambda). L_k is column k of the lower Cholesky factor of
 //!   the covariance P. A function f has the values f+ and f- at the two points of a pair and f0 at the centre.
 //!   The odd part of f is o_k = (f+ - f-) / 2s. The even part of f is e_k = ((f+ + f-) / 2 - f0) / s.
@@ -15,10 +16,11 @@
 //!   instead of 2 N + 1.
 //! * For each SOC interval, the tables contain a straight line per quantity (value and slope). The lines in use are
 //!   cached from step to step: [`LineCache`].
-//! * exp(x + d) = exp(x) exp(d), and exp(-2x) = exp(-x)^2 for the branches' noise.
+//! * One exponential serves several terms: exp(x + d) = exp(x) exp(d). For the branches' noise, exp(-2x) = exp(-x)^2.
 //!
-//! In: states, and for each the charge, time, current, temperature and voltage. Out: the new states, and a mask of
-//! usable states: all numbers finite and possible, the covariance positive definite, the reading within the gate.
+//! In: states, and for each state the charge (A s), time (s), current (A), temperature (degrees C) and voltage (V).
+//! Out: the new states and a mask of usable states. A state is usable if its numbers are finite and possible, its
+//! covariance is positive definite, and its reading is within the gate.
 #![expect(clippy::needless_range_loop, reason = "indices of states say more than iterators over parts of a matrix")]
 
 mod points;
@@ -39,7 +41,6 @@ use crate::cell::estimator::state_vector::{CAPACITY, LOG_RESISTANCE};
 use crate::filter::simd::{Lanes, Mask};
 use crate::quantity::bounds::{self, Bounds};
 
-/// Computes one ordinary step of L cells.
 #[inline(always)]
 pub(super) fn step<const L: usize, const N: usize, const T: usize, const W: usize>(
     tables: &mut Tables<W>,
@@ -64,16 +65,14 @@ pub(super) fn step<const L: usize, const N: usize, const T: usize, const W: usiz
     (x, outcome)
 }
 
-/// Indices of the evidence about the current's offset and the slowest branch.
 pub(super) const EVIDENCE: [usize; 4] = [OFFSET_INFORMATION, OFFSET_SCORE, SLOW_INFORMATION, SLOW_SCORE];
 
-/// Whether a state and `others`, the sum of further numbers, are finite, and whether all variances are positive.
+/// Whether all numbers of a state and `others` (the sum of further numbers) are finite and all variances are positive.
 #[inline(always)]
 pub(super) fn has_variances<const L: usize, const N: usize, const T: usize>(
     x: &FilterState<L, N, T>,
     others: Lanes<L>,
 ) -> Mask<L> {
-    // The sum is not finite when any of its numbers is not.
     let sum = x.mean.iter().chain(&x.covariance).fold(others, |sum, number| sum + *number);
     let least = (1..N).fold(x.covariance[at(0, 0)], |least, i| least.smaller(x.covariance[at(i, i)]));
     sum.is_finite() & least.above_number(0.0)
@@ -103,7 +102,6 @@ fn is_possible<const L: usize, const N: usize, const T: usize>(x: &FilterState<L
 /// slower than the branches.
 const REST_REPEATS_S: f64 = 1000.0;
 
-/// Updates the load's low-pass, the time at rest, and the time that the reading represents.
 #[inline(always)]
 pub(super) fn update_memory<const L: usize>(
     c: &KernelConstants,

@@ -1,6 +1,6 @@
-//! The kernel with one lane. It computes the parts of a step that is not ordinary (see [`super`]).
+//! Runs the kernel for one cell. The estimator uses it for steps that are not ordinary (see [`super`]).
 //!
-//! In: a copy of a cell's state and memory, and a step. Out: the changed copy. If a part cannot be computed, returns
+//! In: a copy of a cell's state and memory, and a step. Out: the changed copy. If the step cannot be computed, returns
 //! `None` and leaves state and memory unchanged.
 
 use super::filter_array::{FilterArrays, each_array};
@@ -40,7 +40,6 @@ impl<'a> SingleCell<'a> {
         }
     }
 
-    /// Predicts over the measured time of a step.
     pub(in crate::cell::estimator) fn predict_measured(
         &mut self,
         (x, memory): (&mut Gaussian, &Memory),
@@ -50,7 +49,7 @@ impl<'a> SingleCell<'a> {
         self.predict((x, memory), &input, self.constants.process.soc_per_s)
     }
 
-    /// Predicts over the unmeasured time of a step, without a current and without noise of the SOC.
+    /// Predicts over the unmeasured time of a step with zero current. The caller adds the noise of the SOC.
     pub(in crate::cell::estimator) fn predict_unmeasured(
         &mut self,
         (x, memory): (&mut Gaussian, &Memory),
@@ -66,7 +65,6 @@ impl<'a> SingleCell<'a> {
         each_array!(&mut *self.filters, array => array.predict(c, (self.cell, x, hot), input, soc_per_s))
     }
 
-    /// Updates load, rest and information of the memory for the measured time of a step.
     pub(in crate::cell::estimator) fn pass_measured(&self, memory: &mut Memory, step: &CellStep) {
         let mut hot = hot(memory, self.constants);
         update_memory(self.constants, &mut hot, &self.input(step, step.measured_s));
@@ -94,7 +92,6 @@ impl<'a> SingleCell<'a> {
     }
 }
 
-/// The values of a memory that the kernel reads.
 pub(super) fn hot(memory: &Memory, c: &KernelConstants) -> HotMemory {
     let mut hot = [0.0; MEMORY];
     hot[LOAD_A] = memory.load_a;

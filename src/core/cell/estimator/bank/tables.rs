@@ -1,36 +1,33 @@
 //! Holds a cell model's tables in the form that the kernel reads.
 //!
-//! Each SOC interval has one row. A row contains a line for every quantity (value at SOC 0, and slope), so one look-up
-//! gives all quantities without a division. Temperatures change slowly, and several cells share a temperature. The rows
-//! of a temperature are therefore computed once and are kept until their slot is reused ([`MAX_ISOTHERMS`]). A cell
-//! stays in its SOC interval for thousands of steps, so its lines are cached lane by lane ([`LineCache`]), and a
-//! look-up is a single comparison. Cached values depend only on temperature, SOC and capacity, so the results do not
-//! depend on the state of the cache.
+//! A row has a line (value at SOC 0, and slope) for every quantity in one SOC interval, so one look-up gives all
+//! quantities without a division. Temperatures change slowly, and several cells share a temperature. The rows of a
+//! temperature are therefore computed once and kept until their slot is reused ([`MAX_ISOTHERMS`]).
 //!
-//! In: states of charge (degrees C). Out: V, ohm, s. A NaN in one lane gives a NaN voltage in this lane only; the step
-//! is then not usable.
+//! A cell stays in its SOC interval for thousands of steps. Its lines are therefore cached ([`LineCache`]), and a
+//! look-up is a single comparison. The results do not depend on the state of the cache.
+//!
+//! In: SOC, temperature (degrees C), capacity (Ah). Out: V, ohm, s. A NaN in one lane (one cell) gives a NaN voltage in
+//! this lane only, and the step is then not usable.
 
 use crate::cell::aged_ocv::{MIXES, OffsetLine};
 use crate::cell::model::CellModel;
 use crate::filter::simd::Lanes;
 
-/// Index of the open-circuit voltage (V) in a row. The slope of every quantity (per unit of SOC) follows its value.
+/// Index of the open-circuit voltage (V) in a row. Each value is followed by its slope (per unit of SOC).
 pub(super) const OCV_V: usize = 0;
 /// Index of the change of the open-circuit voltage with the capacity (V per Ah); the change is 0 if the curve does not
 /// age. The changes per standard deviation of each mix of losses (V) follow.
 pub(super) const OCV_PER_AH: usize = 2;
-/// Index of the series resistance (ohm).
 pub(super) const R0_OHM: usize = OCV_PER_AH + 2 + 2 * MIXES;
 /// Index of the voltage error (V); 0 if the model states no error.
 pub(super) const ERROR_V: usize = R0_OHM + 2;
-/// Index of the first branch's resistance (ohm). Its time constant (s) follows, then the next branch.
 const BRANCHES: usize = ERROR_V + 2;
 
-/// Number of temperatures with cached rows. A pack usually has fewer temperature sensors. If a pack has more, evicted
-/// rows are computed again, with equal results.
+/// Number of temperatures with cached rows. A pack usually has fewer temperature sensors.
 const MAX_ISOTHERMS: usize = 64;
 
-/// Index of the resistance of branch `i`; its time constant follows.
+/// Index of the resistance (ohm) of branch `i`; its time constant (s) follows.
 pub(super) const fn branch(i: usize) -> usize {
     BRANCHES + 4 * i
 }
@@ -41,13 +38,11 @@ pub(super) struct Tables<const W: usize> {
     model: CellModel,
     /// Borders between intervals of SOC; the outer intervals are unbounded.
     borders: Vec<f64>,
-    /// Rows at the model's temperatures, temperature by temperature. The rows of the highest temperature are stored
-    /// twice, so that each temperature has an upper neighbour.
+    /// Rows at the model's temperatures, temperature by temperature. The last rows are stored twice, so that each
+    /// temperature has an upper neighbour.
     nodes: Vec<[f64; W]>,
-    /// Rows at `temperatures_c`.
     rows: Vec<[f64; W]>,
     temperatures_c: [f64; MAX_ISOTHERMS],
-    /// Slot for the rows of the next new temperature.
     next: usize,
     has_error: bool,
 }
@@ -56,9 +51,8 @@ pub(super) struct Tables<const W: usize> {
 #[derive(Debug, Clone)]
 pub(super) struct LineCache<const L: usize, const W: usize> {
     temperature_c: [f64; L],
-    /// Slots in which the rows of each lane's temperature were last found.
+    /// Slot in which the rows of each lane's temperature were last found.
     isotherms: [usize; L],
-    /// Capacities of the open-circuit curves (Ah).
     capacity_ah: [f64; L],
     places: [CachedLines<L, W>; 3],
 }
@@ -67,16 +61,13 @@ pub(super) struct LineCache<const L: usize, const W: usize> {
 #[derive(Debug, Clone)]
 struct CachedLines<const L: usize, const W: usize> {
     interval: [usize; L],
-    /// Lower ends of the intervals.
     from: Lanes<L>,
-    /// Upper ends of the intervals.
     to: Lanes<L>,
     row: [Lanes<L>; W],
-    /// The part of the open-circuit voltage's line that depends on the capacity. It is included in `row`.
+    /// The part of the open-circuit voltage's line that depends on the capacity; already included in `row`.
     offset_v: [Lanes<L>; 2],
 }
 
-/// Points on the lines of L cells.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct TablePoint<'a, const L: usize, const W: usize> {
     row: &'a [Lanes<L>; W],
@@ -118,7 +109,6 @@ impl<const W: usize> Tables<W> {
         }
     }
 
-    /// Finds the rows of a temperature in the cache, or computes them.
     #[cold]
     #[inline(never)]
     fn find(&mut self, temperature_c: f64) -> usize {
@@ -146,12 +136,10 @@ impl<const W: usize> Tables<W> {
         self.borders.len() - 1
     }
 
-    /// The interval of a state of charge.
     fn interval(&self, soc: f64) -> usize {
         self.borders[1..self.intervals()].iter().filter(|&&border| soc >= border).count()
     }
 
-    /// Updates the lines in `cache` to these temperatures.
     #[inline(always)]
     pub(super) fn refresh_temperatures<const L: usize>(
         &mut self,
@@ -177,8 +165,8 @@ impl<const W: usize> Tables<W> {
         }
     }
 
-    /// Updates the lines in `cache` to the open-circuit curves of these capacities (Ah). The capacities change at
-    /// half-cycles.
+    /// Updates the lines in `cache` to the open-circuit curves of these capacities (Ah). The capacities change only at
+    /// the end of a charge or discharge.
     #[inline(always)]
     pub(super) fn refresh_capacities<const L: usize>(&mut self, cache: &mut LineCache<L, W>, capacity_ah: &Lanes<L>) {
         let same = (0..L).fold(true, |same, lane| same & (cache.capacity_ah[lane] == capacity_ah.0[lane]));
@@ -240,8 +228,7 @@ impl<const W: usize> Tables<W> {
         }
     }
 
-    /// Computes the lines of a lane that depend on the capacity of the open-circuit curve (Ah). [`Self::copy`] adds the
-    /// offset to the open-circuit voltage.
+    /// Computes the lines of a lane that depend on the capacity of the open-circuit curve (Ah).
     fn age<const L: usize>(&self, capacity_ah: f64, lines: &mut CachedLines<L, W>, lane: usize) {
         let OffsetLine { offset_v, per_ah_v, mixes_v } =
             self.model.aged_ocv.line(&self.model.soc, lines.interval[lane], capacity_ah);
@@ -253,7 +240,6 @@ impl<const W: usize> Tables<W> {
         }
     }
 
-    /// Copies the lines of a lane's interval at an isotherm into the cache.
     fn copy<const L: usize>(&self, isotherm: usize, lines: &mut CachedLines<L, W>, lane: usize) {
         let row = &self.rows[isotherm * self.intervals() + lines.interval[lane]];
         for k in 0..2 {
@@ -264,7 +250,6 @@ impl<const W: usize> Tables<W> {
 }
 
 impl<const L: usize, const W: usize> LineCache<L, W> {
-    /// A cache without temperatures.
     pub(super) fn new(tables: &Tables<W>) -> Self {
         let zero = Lanes::splat(0.0);
         let lines = CachedLines {
@@ -284,7 +269,6 @@ impl<const L: usize, const W: usize> LineCache<L, W> {
 }
 
 impl<const L: usize, const W: usize> CachedLines<L, W> {
-    /// Whether the cached lines are valid at a lane's state of charge.
     #[inline(always)]
     fn holds(&self, soc: &Lanes<L>, lane: usize) -> bool {
         (soc.0[lane] >= self.from.0[lane]) & (soc.0[lane] < self.to.0[lane])
@@ -297,7 +281,6 @@ impl<'a, const L: usize, const W: usize> TablePoint<'a, L, W> {
         Self { row: &lines.row, soc, inside: soc.at_least(0.0).at_most(1.0) }
     }
 
-    /// Open-circuit voltage (V), its slope (V per unit of SOC), and series resistance (ohm).
     #[inline(always)]
     pub(super) fn ocv_and_r0(&self) -> (Lanes<L>, Lanes<L>, Lanes<L>) {
         let slope_v = self.row[OCV_V + 1];
@@ -311,20 +294,18 @@ impl<'a, const L: usize, const W: usize> TablePoint<'a, L, W> {
         std::array::from_fn(|i| self.row[OCV_PER_AH + 2 * i] + self.row[OCV_PER_AH + 2 * i + 1] * self.soc)
     }
 
-    /// Resistance (ohm) and time constant (s) of a branch.
     #[inline(always)]
     pub(super) fn branch(&self, i: usize) -> (Lanes<L>, Lanes<L>) {
         (self.one(branch(i)), self.one(branch(i) + 2))
     }
 
-    /// One quantity; constant beyond the ends of the tables.
+    /// The quantity at index `at`; constant beyond the ends of the tables.
     #[inline(always)]
     pub(super) fn one(&self, at: usize) -> Lanes<L> {
         self.row[at] + self.row[at + 1] * self.inside
     }
 }
 
-/// Row of the interval that starts at SOC breakpoint `s`, at temperature breakpoint `t`.
 fn row<const W: usize>(model: &CellModel, t: usize, s: usize) -> [f64; W] {
     let mut row = [0.0; W];
     let mut set = |index: usize, value: &dyn Fn(usize) -> f64| {

@@ -1,4 +1,4 @@
-//! Compares the kernel with the textbook filter. Also compares a cell in a pack with the same cell alone.
+//! Compares the kernel with the textbook filter, and a cell in a pack with the same cell alone.
 
 use super::*;
 use crate::cell::circuit::{self, BranchAt};
@@ -9,7 +9,7 @@ use crate::cell::model::tests::small_model;
 use crate::cell::{AgedOcv, CellModule, PackBank, SensorErrors, Table};
 use crate::quantity::CellIndex;
 
-/// Settings in which every constant error is larger than 0.
+/// Settings in which every constant error of the sensors is larger than 0.
 fn config() -> EstimatorConfig {
     let sensor =
         SensorErrors { voltage_offset_v: 0.004, current_offset_a: 0.02, current_gain: 0.005, slow_branch: 0.3 };
@@ -56,7 +56,7 @@ impl Pack {
         Self { model: model.clone(), dice: Dice(0x2545_F491_4F6C_DD1D), cells, current_a: 1.0, temperature_c: 20.0 }
     }
 
-    /// The steps at one time. Some cells are missing at some times.
+    /// The steps at one time, without some of the cells.
     fn steps(&mut self, time: u32) -> Vec<(usize, CellStep)> {
         let dt_s = if time.is_multiple_of(7) { 0.25 } else { 1.0 };
         let low = self.cells.iter().any(|cell| cell.soc < 0.1);
@@ -113,13 +113,11 @@ impl Pack {
     }
 }
 
-/// Makes the steps of one batch.
 fn step(bank: &mut EstimatorBank, steps: &[(usize, CellStep)]) {
     steps.iter().for_each(|(cell, step)| bank.add(*cell, step));
     bank.step();
 }
 
-/// The small model with `branches` branches.
 fn model(branches: usize) -> CellModel {
     let mut model = small_model();
     let slower = |by: f64| {
@@ -131,7 +129,7 @@ fn model(branches: usize) -> CellModel {
     model
 }
 
-/// Maximum difference of the SOC, and maximum difference of all other values, between the bank and the textbook filter.
+/// Maximum differences between bank and textbook filter: of the SOC, and of all other values.
 fn differences<const N: usize>(model: &CellModel, config: &EstimatorConfig, rounds: u32) -> (f64, f64) {
     const CELLS: usize = 11;
     let mut bank = EstimatorBank::new(model, config, CELLS);
@@ -163,8 +161,8 @@ fn differences<const N: usize>(model: &CellModel, config: &EstimatorConfig, roun
             (soc, others) = (soc.max(of_soc), others.max(of_others));
         }
         if time % 2500 == 1249 {
-            // Half-cycles change the capacity of the curve. Afterwards, both filters must use the curve of the aged
-            // cell at every temperature and in every SOC interval.
+            // At the end of a charge or discharge, the capacity of the curve changes. Both filters must then use the
+            // aged curve at every temperature and in every SOC interval.
             for (cell, textbook) in textbooks.iter_mut().enumerate() {
                 let mean = model.capacity_ah * (0.95 - 0.02 * cell as f64);
                 let curve = ScalarGaussian { mean, ..bank.cell(cell).curve() };
@@ -287,7 +285,7 @@ fn bank_returns_stored_estimator_unchanged() {
     assert_eq!((bank.soc(4), bank.cell(4).capacity().mean), (None, config.initial.capacity_ah));
 }
 
-/// The estimates of cells of two kinds in one pack equal, bit for bit, the estimates of each kind in a separate bank.
+/// In a pack with two kinds of cells, each kind has the same estimates, bit for bit, as in a separate bank.
 #[test]
 fn mixed_modules_match_separate_banks() {
     let (model, other) = (small_model(), CellModel { capacity_ah: 3.0, ..small_model() });

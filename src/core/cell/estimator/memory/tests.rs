@@ -23,15 +23,14 @@ fn near(a: f64, b: f64) -> bool {
     (a - b).abs() < 1e-9 * b.abs().max(1.0)
 }
 
-/// Computes a step whose current is unknown at the reading, so its voltage is not used. Returns the time that counts as
-/// new information (s).
+/// Computes a step without a known current, so its voltage is not used. Returns the time that counts as new information
+/// (s).
 fn new_information_s(estimator: &mut CellEstimator, step: CellStep) -> f64 {
     let before_s = estimator.memory.information_s;
     estimator.step(&small_model(), &config(), &CellStep { current_a: None, ..step });
     estimator.memory.information_s - before_s
 }
 
-/// An estimator that has used a first voltage.
 fn started() -> CellEstimator {
     let mut estimator = CellEstimator::new(&config());
     estimator.step(&small_model(), &config(), &step(1.0, 1.0, 0.0));
@@ -44,7 +43,7 @@ fn rest_counts_logarithm_of_its_length() {
         let mut estimator = started();
         let steps = (36_000.0 / dt_s) as u32;
         let information_s: f64 = (0..steps).map(|_| new_information_s(&mut estimator, step(0.0, dt_s, 0.0))).sum();
-        // 10 h at rest count as 3.6 times 1000 s.
+        // Ten hours at rest count as 3.6 times 1000 s.
         assert!(near(information_s, 1000.0 * libm::log(1.0 + 36.0)), "{dt_s}: {information_s}");
     }
 }
@@ -97,7 +96,7 @@ fn possible_use_depends_on_load_and_gap_length() {
         let std = memory.note_gap(config, &step(current_a, 0.0, gap_s), 2.0);
         (std, memory.downtime_std, memory.used_prior)
     };
-    // 4 A on 2 Ah (2 C) for 900 s move more charge than a charger with C/2.
+    // In 900 s, 4 A on 2 Ah (2 C) move more charge than a charger with C/2.
     let (std, downtime_std, used) = after(&config, 4.0, 900.0);
     assert!(
         std == 0.0 && near(downtime_std, 0.5 / 3.0_f64.sqrt()) && near(used, LOADED_PRIOR),
@@ -108,7 +107,6 @@ fn possible_use_depends_on_load_and_gap_length() {
     assert!(near(downtime_std, 0.6 / 3.0_f64.sqrt()) && near(used, 0.1 * CHARGER_PRIOR), "{downtime_std} {used}");
     assert!([43_200.0, 604_800.0].iter().all(|&gap_s| near(after(&config, 0.0, gap_s).2, CHARGER_PRIOR)));
     assert_eq!(after(&config, 0.0, 3599.0), (0.0, 0.0, 0.0));
-    // A short load adds noise; a short rest adds nothing.
     assert!(near(after(&config, 1.0, 1.0).0, 0.5 / 3600.0 / 3.0_f64.sqrt()));
     assert_eq!((after(&config, 1.0, 1.0).1, after(&config, 0.0, 1.0)), (0.0, (0.0, 0.0, 0.0)));
     config.gap.silence_is_rest = true;
@@ -128,12 +126,11 @@ fn noted_downtime_counts_once() {
     let mut at_rest = noted();
     at_rest.note_gap(&config, &step(0.0, 0.0, 60.0), 2.0);
     assert_eq!(at_rest, Memory { noted_s: 0.0, ..noted() });
-    // The load of 3 C after the gap may have flowed during the gap: 0.05 of SOC.
+    // The load of 3 C after the gap may also have flowed during the gap, which would move 0.05 of SOC.
     let mut loaded = noted();
     loaded.note_gap(&config, &step(6.0, 0.0, 60.0), 2.0);
     assert!(near(loaded.downtime_std, 0.05 / 3.0_f64.sqrt()), "{loaded:?}");
     assert!(near(loaded.used_prior, USED_PRIOR), "{loaded:?}");
-    // The next voltage ends the noted downtime.
     let mut used = noted();
     used.end_downtime();
     assert_eq!((used.noted_s, used.downtime_std, used.used_prior), (0.0, 0.0, 0.0));

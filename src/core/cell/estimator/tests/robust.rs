@@ -1,22 +1,19 @@
 //! Tests the estimator with wrong initial values, with an offset of the current sensor, and at rests during which the
-//! cell still relaxes.
-//!
-//! The simulated cell has a slow branch that the estimator's model lacks; there is no noise.
+//! cell still relaxes. The simulated cell has a slow branch that the estimator's model lacks, and no noise.
 
 use super::*;
 
-/// Time constant of the slow polarisation that the estimator's model lacks (s).
+/// Time constant of the slow branch (s).
 const SLOW_TAU_S: f64 = 1500.0;
 
-/// Resistance of the slow polarisation (ohm). It is a fifth of the model's resistance. From 15 mohm on, the intervals
-/// would be too narrow: the default model error of 0.15 V over one second does not cover an error that lasts for 1500
-/// s.
+/// Resistance of the slow branch (ohm): a fifth of the model's resistance. From 15 mohm on, the intervals would be too
+/// narrow, because the default model error of 0.15 V over one second does not cover an error that lasts for 1500 s.
 const SLOW_OHM: f64 = 0.01;
 
-/// Half of a 95 % interval, standard deviations.
+/// Half of the width of a 95 % interval in standard deviations.
 const STD_OF_95: f64 = 1.96;
 
-/// An estimator and a cell with slow polarisation, behind a current sensor with an offset.
+/// An estimator, a cell with the slow branch, and a current sensor with an offset.
 struct Bench {
     estimator: CellEstimator,
     config: EstimatorConfig,
@@ -27,7 +24,7 @@ struct Bench {
     offset_a: f64,
 }
 
-/// Errors during a part of the test, percentage points of SOC.
+/// Errors during a part of the test, in percentage points of SOC.
 #[derive(Debug, Clone, Copy, Default)]
 struct StretchErrors {
     largest_error: f64,
@@ -90,11 +87,11 @@ fn three_days(slow_ohm: f64, offset_a: f64) -> StretchErrors {
 
 #[test]
 fn current_offset_does_not_drift_soc() {
-    // An offset of 0.5 % of 1 C (2 Ah): 10 mA. In 72 h it adds 0.72 Ah, 36 percentage points.
+    // The offset is 0.5 % of 1 C (2 Ah), which is 10 mA. In 72 h, it adds 0.72 Ah or 36 percentage points.
     for offset_a in [-0.01, 0.01] {
         let worst = three_days(0.0, offset_a);
         assert!(worst.largest_error < 0.75, "{offset_a} A: {worst:?}");
-        // The interval does not include the offset: for a permanent offset, it is up to a quarter too narrow.
+        // The interval does not include the offset, so it is up to a quarter too narrow for a permanent offset.
         assert!(worst.largest_ratio < 1.25, "{offset_a} A: {worst:?}");
         let worst = three_days(SLOW_OHM, offset_a);
         assert!(worst.largest_error < 1.25, "with a slow branch, {offset_a} A: {worst:?}");
@@ -118,7 +115,7 @@ fn thirty_point_error_recovers_within_minutes() {
 #[test]
 fn interval_covers_error_while_cell_relaxes() {
     for current_a in [1.0, -1.0] {
-        // The filter starts together with the load, so it has never had a voltage at rest.
+        // The filter starts together with the load, so it has never used a voltage at rest.
         let mut bench = Bench::new(0.5 + 0.3 * current_a, None, SLOW_OHM, 0.0);
         bench.run(current_a, 3600.0);
         let mut rested_s = 0.0;
@@ -127,10 +124,9 @@ fn interval_covers_error_while_cell_relaxes() {
             rested_s = until_s;
             assert!(seen.largest_ratio < 1.0, "{current_a} A, {until_s} s: {seen:?}");
         }
-        // The slow branch has relaxed, so the voltage is the open-circuit voltage, and the estimate has converged to
-        // the true SOC.
+        // The slow branch has relaxed, so the voltage is the open-circuit voltage.
         assert!(bench.error_points().abs() < 0.5, "{current_a} A: {}", bench.error_points());
-        // Ten hours of rest count as 1000 s x ln 37 under load, not as ten hours.
+        // Ten hours of rest count as 1000 s x ln 37 under load.
         let least = 100.0 * STD_OF_95 * bench.config.voltage.model_error_v_sqrt_s / 1.2 / libm::sqrt(3600.0);
         assert!(bench.half_width_points() > least, "{current_a} A: {} {least}", bench.half_width_points());
     }

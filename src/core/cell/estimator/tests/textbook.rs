@@ -1,7 +1,7 @@
 //! The filter in its textbook form, as a reference for the kernel: every sigma point passes through the whole circuit.
 //!
-//! The textbook filter computes steps with a measured or unmeasured time and a voltage by itself. After a start,
-//! downtime or learning, it copies the state of the estimator under test.
+//! After a start, a downtime or learning, the textbook filter copies the state of the estimator under test. It computes
+//! all other steps by itself.
 
 mod circuit;
 mod noise;
@@ -16,10 +16,8 @@ use crate::cell::Update;
 use crate::cell::estimator::memory::Memory;
 use crate::cell::estimator::state_vector::{CURRENT_OFFSET, SLOW_BRANCH, square};
 
-/// The textbook filter of one cell.
 pub(in crate::cell::estimator) struct Textbook<const N: usize> {
     x: Gaussian<N>,
-    /// The memory as the textbook updates it.
     memory: Memory,
 }
 
@@ -29,7 +27,6 @@ impl<const N: usize> Textbook<N> {
         Self { x, memory: Memory::new(config) }
     }
 
-    /// Takes the state of an estimator.
     pub(in crate::cell::estimator) fn copy(&mut self, estimator: &CellEstimator) {
         self.memory = estimator.memory;
         if let Some(x) = &estimator.filter {
@@ -118,8 +115,8 @@ impl<const N: usize> Textbook<N> {
         }
     }
 
-    /// Compares with an estimator: returns the difference of the SOC and the maximum difference of all other values. If
-    /// a number of the memory is larger than 1, its difference is relative to the number.
+    /// Returns the difference of the SOC, and the maximum difference of all other values. Numbers of the memory above 1
+    /// are compared relative to their size.
     pub(in crate::cell::estimator) fn differences(&self, estimator: &CellEstimator) -> (f64, f64) {
         let near = |a: ScalarGaussian, b: ScalarGaussian| (a.mean - b.mean).abs().max((a.std() - b.std()).abs());
         let x = estimator.filter.as_ref().expect("started");
@@ -134,7 +131,6 @@ impl<const N: usize> Textbook<N> {
         (near(self.x.marginal(0), x.marginal(0)), others.chain(memory).fold(0.0, f64::max))
     }
 
-    /// Sets the capacity of the open-circuit curve.
     pub(in crate::cell::estimator) fn set_curve(&mut self, curve: ScalarGaussian) {
         self.memory.curve = curve;
     }

@@ -1,6 +1,6 @@
 //! Predicts the voltages of a notebook's rows from the parameters of a fit, with derivatives.
 //!
-//! In: parameters (indices below) and rows. Out: V. A row's voltage is linear in the curve and in all resistances.
+//! In: parameters and rows. Out: V. A row's voltage is linear in the curve and in all resistances.
 
 use nalgebra::{DMatrix, DVector};
 
@@ -11,24 +11,22 @@ use crate::cell::notebook::Row;
 use crate::cell::own_model::{FACTOR_NODES, OwnModel, SOC_NODES};
 use crate::filter::interpolation::{between, locate_clamped};
 
-/// Index of the first parameter of each group. From index 0: difference from the label's curve (V) at the SOC
-/// breakpoints. [`FACTORS`]: ln of the resistance factors over SOC. [`BY_TEMPERATURE`]: deviation of each resistance's
-/// activation energy from the usual one, fraction. [`COLD_SAG`]: difference from the label's cold sag (V).
-/// [`LOG_CAPACITY`]: ln of the capacity (Ah). [`OFFSET`]: offset of the current sensor (A) (measured minus true).
-/// [`BEGINNINGS`]: SOC at the start of each stretch.
+/// Index of the first parameter of each group. The curve starts at index 0: difference from the label's curve (V) at
+/// the SOC breakpoints. [`FACTORS`]: ln of the resistance factors over SOC. [`BY_TEMPERATURE`]: relative deviation of
+/// each resistance's activation energy. [`COLD_SAG`]: difference from the label's sag of the curve in the cold (V).
+/// [`LOG_CAPACITY`]: ln of the capacity (Ah). [`OFFSET`]: offset of the current sensor (A, measured minus true).
+/// [`BEGINNINGS`]: SOC at the start of each stretch (a period with a continuously measured current).
 pub(super) const FACTORS: usize = SOC_NODES;
 pub(super) const BY_TEMPERATURE: usize = FACTORS + RESISTANCES * FACTOR_NODES;
 pub(super) const COLD_SAG: usize = BY_TEMPERATURE + RESISTANCES;
 pub(super) const LOG_CAPACITY: usize = COLD_SAG + 1;
 pub(super) const OFFSET: usize = LOG_CAPACITY + 1;
 pub(super) const BEGINNINGS: usize = OFFSET + 1;
-/// Number of parameters, other than resistance parameters, that change the voltage of a row.
+/// Number of parameters that change the voltage of a row and do not belong to a resistance.
 pub(super) const CURVE_AND_SOC: usize = 6;
 
-/// Limits of the SOC at the start of a stretch.
 pub(super) const BEGINNING: (f64, f64) = (-0.05, 1.05);
 
-/// The label's model and curve, and the rows to be fitted.
 pub(super) struct Basis<'a> {
     pub(super) model: &'a CellModel,
     pub(super) curve: &'a CurvePrior,
@@ -39,20 +37,16 @@ pub(super) struct Basis<'a> {
     pub(super) stretch: Vec<usize>,
 }
 
-/// Predicted voltage of a row, with derivatives.
 pub(super) struct Prediction {
     pub(super) voltage_v: f64,
-    /// Voltage drop in the cell (V).
     pub(super) drop_v: f64,
     pub(super) soc: f64,
-    /// Slope of the open-circuit voltage (V per unit of SOC).
     pub(super) slope_v: f64,
     pub(super) ohm: [f64; RESISTANCES],
-    /// Derivatives of ln(resistance) with respect to the three parameters of a resistance: its factors at two SOC nodes
-    /// and the deviation of its activation energy.
+    /// Derivatives of ln(resistance) by the three parameters of a resistance: the factors at two SOC nodes, and the
+    /// deviation of the activation energy.
     pub(super) by_factor: [f64; 3],
-    /// Indices of the parameters that change the voltage: [`CURVE_AND_SOC`] parameters first, then three parameters per
-    /// resistance.
+    /// Indices of the parameters that change the voltage: [`CURVE_AND_SOC`] parameters, then three per resistance.
     pub(super) index: Vec<usize>,
     pub(super) slope: Vec<f64>,
 }
@@ -64,12 +58,11 @@ impl<'a> Basis<'a> {
         Self { model: &prior.model, curve: &prior.curve, expected: prior.expected.as_ref(), rows, stretch }
     }
 
-    /// Number of parameters.
     pub(super) fn size(&self) -> usize {
         BEGINNINGS + self.stretch.last().map_or(0, |last| last + 1)
     }
 
-    /// The parameters of a model (`None` = the expected model), with the most likely SOC at the start of each stretch.
+    /// The parameters of a model (`None` = the expected model). Each stretch starts at its most likely SOC.
     pub(super) fn parameters(&self, own: Option<&OwnModel>) -> DVector<f64> {
         let own = own.or(self.expected);
         let mut theta = DVector::zeros(self.size());
@@ -88,7 +81,6 @@ impl<'a> Basis<'a> {
         theta
     }
 
-    /// Limits the parameters to possible values.
     pub(super) fn bound(theta: &mut DVector<f64>) {
         for (i, value) in theta.iter_mut().enumerate().skip(FACTORS) {
             let (low, high) = match i {
@@ -101,7 +93,6 @@ impl<'a> Basis<'a> {
         }
     }
 
-    /// Predicts the voltage of the row with index `at`.
     pub(super) fn predict(&self, theta: &DVector<f64>, at: usize) -> Prediction {
         let row = &self.rows[at];
         let beginning = BEGINNINGS + self.stretch[at];
@@ -142,8 +133,7 @@ impl<'a> Basis<'a> {
         Prediction { voltage_v, drop_v, soc, slope_v, ohm, by_factor, index, slope }
     }
 
-    /// The most likely value of the parameter `k`, which is the SOC at the start of a stretch. All other parameters
-    /// stay fixed.
+    /// The most likely value of the parameter `k` (SOC at the start of a stretch) if all other parameters stay fixed.
     fn likeliest_beginning(&self, theta: &DVector<f64>, k: usize) -> f64 {
         let mut theta = theta.clone();
         let rows: Vec<usize> = (0..self.rows.len()).filter(|&at| BEGINNINGS + self.stretch[at] == k).collect();
@@ -153,7 +143,7 @@ impl<'a> Basis<'a> {
                 let Prediction { voltage_v, drop_v, .. } = self.predict(&theta, at);
                 let deviations =
                     (voltage_v - f64::from(self.rows[at].voltage_v)).abs() / f64::hypot(0.02, 0.1 * drop_v);
-                // Beyond three standard deviations, the cost grows linearly.
+                // Beyond three standard deviations, the cost grows linearly (Huber).
                 if deviations <= 3.0 { 0.5 * deviations * deviations } else { 3.0 * (deviations - 1.5) }
             };
             rows.iter().map(row_cost).sum::<f64>()

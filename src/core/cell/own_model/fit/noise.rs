@@ -1,7 +1,7 @@
 //! Computes the covariance of the errors of a notebook's rows, and the cost of residuals.
 //!
 //! In: predictions and rows (means of readings over a short time). Out: the normal equations of the whitened residuals,
-//! and the cost of the residuals (minus the logarithm of their density).
+//! and their cost (minus the logarithm of their density).
 
 use nalgebra::{DMatrix, DVector};
 
@@ -9,13 +9,12 @@ use super::basis::{Basis, CURVE_AND_SOC, Prediction};
 use crate::cell::notebook::{CurrentSteps, Row};
 use crate::filter::bell;
 
-/// Standard deviation of a row's voltage (V).
 const ROW_V: f64 = 0.006;
 /// Residuals beyond this many standard deviations count linearly (Huber).
 const HUBER: f64 = 3.0;
 
-/// Standard deviations of the errors that repeat at nearly the same SOC: of the voltage (V), of the SOC, and of the
-/// voltage drop (fraction).
+/// Standard deviations of the errors that repeat at nearly the same SOC: voltage (V), SOC (fraction), voltage drop
+/// (fraction).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct RepeatedErrors {
     voltage_v: f64,
@@ -24,25 +23,22 @@ pub(super) struct RepeatedErrors {
 }
 
 impl RepeatedErrors {
-    /// Repeating errors of usual circuit models, for fitting the capacity.
+    /// Usual errors of circuit models, for fitting the capacity.
     pub(super) const USUAL: Self = Self { voltage_v: 0.012, soc: 0.01, drop: 0.2 };
-    /// Repeating errors for fitting the tables. These errors are smaller than `USUAL`, so that a deviation that many
-    /// rows share changes the tables and does not count as an error.
+    /// Smaller errors for fitting the tables. A deviation that many rows share then changes the tables instead of
+    /// counting as an error.
     pub(super) const IN_TABLES: Self = Self { voltage_v: 0.004, soc: 0.004, drop: 0.05 };
 }
 
-/// Sums for one Gauss-Newton step: normal matrix, gradient and cost.
 pub(super) struct NormalEquations {
     pub(super) normal: DMatrix<f64>,
     pub(super) gradient: DVector<f64>,
     pub(super) cost: f64,
-    /// Sum of the rows' squared residuals, in standard deviations.
     pub(super) squares: f64,
 }
 
 impl NormalEquations {
-    /// Adds a residual with its weight. `index`: the parameters that change the residual; `slope`: derivatives with
-    /// respect to these parameters.
+    /// Adds a residual with its weight. `slope`: derivatives of the residual by the parameters in `index`.
     fn add(&mut self, index: &[usize], slope: &[f64], residual: f64, weight: f64) {
         for (&i, a) in index.iter().zip(slope) {
             self.gradient[i] += weight * a * residual;
@@ -52,12 +48,12 @@ impl NormalEquations {
         }
     }
 
-    /// Adds all rows at the parameters `theta`; `None` if the covariance of the rows' errors cannot be factorised.
+    /// Adds all rows at the parameters `theta`; `None` if the covariance of the rows' errors has no Cholesky factor.
     pub(super) fn add_rows(&mut self, basis: &Basis<'_>, theta: &DVector<f64>, errors: &RepeatedErrors) -> Option<()> {
         let predictions: Vec<Prediction> = (0..basis.rows.len()).map(|at| basis.predict(theta, at)).collect();
         let (count, size) = (predictions.len(), theta.len());
         let lower = covariance(&predictions, errors).cholesky()?.unpack();
-        // Residuals and derivatives in one matrix, so that they are whitened together.
+        // Residuals and derivatives are in one matrix, so that they are whitened together.
         let mut all = DMatrix::zeros(count, size + 1);
         for (at, prediction) in predictions.iter().enumerate() {
             all[(at, size)] = prediction.voltage_v - f64::from(basis.rows[at].voltage_v);
@@ -90,13 +86,12 @@ impl NormalEquations {
         Some(())
     }
 
-    /// Adds what a row's current steps show about the series resistance and the fastest branch. The row contains the
-    /// sums of the least-squares problem v = - R0 i - R1 x. The Cholesky factor of the sums of i and x turns this
-    /// problem into two equations.
+    /// Adds the information of a row's current steps about the series resistance and the fastest branch. The row
+    /// contains the sums of the least-squares problem v = - R0 i - R1 x (symbols as in [`CurrentSteps`]). The Cholesky
+    /// factor of the sums of i and x turns this problem into two equations.
     fn add_steps(&mut self, row: &Row, prediction: &Prediction) {
         let CurrentSteps { ii, ix, xx, iv, xv } = row.steps;
         let [ii, ix, xx, iv, xv] = [ii, ix, xx, iv, xv].map(f64::from);
-        // Without current steps, the sums contain no information.
         if ii <= 1e-12 {
             return;
         }
@@ -104,7 +99,7 @@ impl NormalEquations {
         let of_x = (xx - of_i[1] * of_i[1]).max(0.0).sqrt();
         let v_i = iv / of_i[0];
         let v_x = if of_x > 0.0 { (xv - of_i[1] * v_i) / of_x } else { 0.0 };
-        // The voltage of the steps has an error of 10 mV. The steps of one row determine a resistance to 20 % at best.
+        // The voltage of a step has an error of 10 mV. The steps of one row determine a resistance to 20 % at best.
         let weight = f64::min(1.0 / (0.01 * 0.01), 1.0 / (0.2 * 0.2 * v_i * v_i));
         let Prediction { ohm: [series_ohm, fast_ohm, ..], by_factor, index, .. } = prediction;
         let residuals_v = [v_i + of_i[0] * series_ohm + of_i[1] * fast_ohm, v_x + of_x * fast_ohm];
@@ -112,7 +107,6 @@ impl NormalEquations {
             let of = |per: f64| by_factor.map(|factor| per * factor);
             [of(per_series * series_ohm), of(per_fast * fast_ohm)].concat()
         };
-        // The parameters of the series resistance and of the fastest branch.
         let index = &index[CURVE_AND_SOC..CURVE_AND_SOC + 2 * by_factor.len()];
         self.add(index, &slope(of_i[0], of_i[1]), residuals_v[0], weight);
         self.add(index, &slope(0.0, of_x), residuals_v[1], weight);
@@ -120,7 +114,6 @@ impl NormalEquations {
     }
 }
 
-/// Covariance of the rows' errors (V^2).
 fn covariance(predictions: &[Prediction], errors: &RepeatedErrors) -> DMatrix<f64> {
     let drop_v: Vec<f64> = predictions.iter().map(|it| it.drop_v * (1.0 + 3.0 * it.drop_v.abs())).collect();
     DMatrix::from_fn(predictions.len(), predictions.len(), |a, b| {
@@ -130,7 +123,7 @@ fn covariance(predictions: &[Prediction], errors: &RepeatedErrors) -> DMatrix<f6
         let of = |v: f64, soc: f64, drop: f64| {
             v * v + soc * soc * x.slope_v * y.slope_v + drop * drop * drop_v[a] * drop_v[b]
         };
-        // Independent errors of each row.
+        // Each row also has independent errors.
         let own = if a == b { of(ROW_V, 0.01, 0.08) } else { 0.0 };
         own + near * of(errors.voltage_v, errors.soc, errors.drop)
     })

@@ -1,4 +1,4 @@
-//! Computes the prior of a cell's parameters from the cell's label, as an information matrix.
+//! Computes the prior of a fit's parameters from the cell's label, as an information matrix.
 
 use nalgebra::DMatrix;
 
@@ -7,19 +7,18 @@ use crate::cell::chemistry::{FACTOR_SOC, LabelPrior, RESISTANCES, curve};
 use crate::cell::own_model::{FACTOR_NODES, SOC_NODES};
 use crate::filter::bell;
 
-/// Standard deviation, between cells, of the part of ln(resistance) that all resistances of a cell share. This constant
-/// and the next three were determined from five cells. The usual resistances of the label's model come from the same
-/// cells.
+/// All resistances of a cell share a part of ln(resistance). This is the standard deviation of this part between cells.
+/// This constant and the next three come from the five cells that also gave the usual resistances of the label's model.
 const COMMON_LOG_STD: f64 = 0.35;
-/// Standard deviation of ln(resistance) of each single resistance, in addition to the common standard deviation.
+/// Standard deviation of ln(resistance) of each resistance, in addition to the shared part.
 const PART_LOG_STD: [f64; RESISTANCES] = [0.3, 0.4, 0.4, 0.5];
-/// Standard deviation by which each ln(resistance) varies over the SOC.
+/// Standard deviation with which each ln(resistance) varies over the SOC.
 const SHAPE_LOG_STD: f64 = 0.15;
-/// Additional standard deviation of ln(resistance) at the first three SOC nodes, near empty; all resistances share this
-/// deviation. The open-circuit curve is steep near empty, so diffusion appears as resistance.
+/// Additional standard deviation at the first three SOC nodes, shared by all resistances. Near empty, the open-circuit
+/// curve is steep, so diffusion appears as resistance.
 const LOW_LOG_STD: [f64; 3] = [0.7, 0.6, 0.5];
 
-/// Information matrix of the parameters' prior, whose means are the expected values. `None` if a
+/// Information matrix of the parameters' prior. The means of the prior are the expected values. Returns `None` if a
 /// covariance is not positive definite.
 pub(super) fn information(of: &LabelPrior, size: usize) -> Option<DMatrix<f64>> {
     let log_ratio = of.log_resistance_ratio;
@@ -33,14 +32,14 @@ pub(super) fn information(of: &LabelPrior, size: usize) -> Option<DMatrix<f64>> 
     (BY_TEMPERATURE..COLD_SAG).for_each(|i| near(i, 0.25 * log_ratio));
     near(COLD_SAG, of.cold_sag_std_v);
     near(LOG_CAPACITY, of.capacity_std);
-    // Standard deviation of the offset: the current that moves the rated capacity in 700 h.
+    // One standard deviation of the offset moves the rated capacity in 700 h.
     near(OFFSET, of.label.rated_ah / 700.0);
-    // Wide prior, because the voltages determine the SOC at the start of a stretch.
+    // SOC at the start of a stretch. The prior is wide, because the voltages determine this SOC.
     (BEGINNINGS..size).for_each(|i| near(i, 0.5));
     Some(prior)
 }
 
-/// Covariance of the logarithms of the two resistance factors with the indices `a` and `b`.
+/// Covariance of the two parameters in [`FACTORS`] with the indices `a` and `b`.
 fn factor_covariance(a: usize, b: usize) -> f64 {
     let ((i, n), (j, m)) = ((a / FACTOR_NODES, a % FACTOR_NODES), (b / FACTOR_NODES, b % FACTOR_NODES));
     let near = |width: f64| bell((FACTOR_SOC[n] - FACTOR_SOC[m]) / width);
@@ -50,7 +49,6 @@ fn factor_covariance(a: usize, b: usize) -> f64 {
     common + if i == j { part } else { 0.0 } + if a == b { 1e-4 } else { 0.0 }
 }
 
-/// Logarithm of the determinant of a matrix; `None` if the matrix is not positive definite.
 pub(super) fn log_determinant(matrix: &DMatrix<f64>) -> Option<f64> {
     let lower = matrix.clone().cholesky()?.unpack();
     Some((0..lower.nrows()).map(|i| 2.0 * libm::log(lower[(i, i)])).sum())

@@ -1,4 +1,4 @@
-//! Tests how a fit computes the mean and variance of the capacity from the costs on the capacity grid.
+//! Tests the mean and variance of the capacity that follow from the costs on the capacity grid.
 
 use super::*;
 

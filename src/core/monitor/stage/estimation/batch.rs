@@ -1,8 +1,8 @@
 //! Collects the samples of cells that report one after another. When every cell has reported, the filters of all cells
-//! are stepped together.
+//! run together.
 //!
-//! The waiting time of a sample does not affect its step: the step uses the time and the charge of the sample, not the
-//! time at which the step runs.
+//! The result does not depend on how long a sample waits. A filter step uses the time and the charge of its sample, not
+//! the time at which the step runs.
 
 use crate::quantity::CellIndex;
 use crate::sample::CellSample;
@@ -10,7 +10,7 @@ use crate::sample::CellSample;
 /// A batch: the cells that have reported since the pack's values were last combined, and their waiting samples.
 #[derive(Debug)]
 pub(crate) struct CellBatch {
-    /// Samples that wait for their step, in the order of arrival, at most one per cell.
+    /// Samples that wait for their filter step, in the order of arrival, at most one per cell.
     pub(crate) waiting: Vec<CellSample>,
     has_reported: Vec<bool>,
     pub(crate) reported: usize,
@@ -21,7 +21,6 @@ impl CellBatch {
         Self { waiting: Vec::with_capacity(cells), has_reported: vec![false; cells], reported: 0 }
     }
 
-    /// Restores a stored batch.
     pub(crate) fn restore(has_reported: Vec<bool>, waiting: Vec<CellSample>) -> Self {
         let reported = has_reported.iter().filter(|&&reported| reported).count();
         Self { waiting, has_reported, reported }
@@ -37,7 +36,6 @@ impl CellBatch {
         self.has_reported.get(cell.index()) == Some(&false)
     }
 
-    /// Adds a sample of a cell that has not reported in this batch.
     #[inline]
     pub(crate) fn add(&mut self, sample: CellSample) {
         debug_assert!(!self.has_reported[sample.cell.index()], "a second sample of {:?}", sample.cell);
@@ -51,7 +49,7 @@ impl CellBatch {
         self.reported == self.has_reported.len()
     }
 
-    /// Starts the next batch, after the samples of the last batch have been stepped.
+    /// Starts the next batch, after the filters have used the samples of the last batch.
     pub(crate) fn begin(&mut self) {
         debug_assert!(self.waiting.is_empty(), "{} samples without their step", self.waiting.len());
         self.has_reported.fill(false);

@@ -1,29 +1,27 @@
-//! Compares the steps of the measured current with the steps of the cells' voltages.
+//! Checks the current sensor: compares the steps of the measured current with the steps of the cells' voltages.
 //!
-//! In: samples of the compared cells, and the series resistance according to the model. Out: whether the current is
-//! doubtful.
+//! In: samples of the compared cells, and the series resistance of the model. Out: whether the current is doubtful.
 //!
 //! A *round* contains one sample of each cell, and the mean current of these samples. A round is complete when all
-//! cells of the previous round have reported. If one of them is missing, the round ends when another cell reports again,
+//! cells of the previous round have reported. If a cell is missing, the round ends when another cell reports again,
 //! after a pause ([`PAUSE_SHARE`]) or after [`MAX_ROUND_S`].
 //!
 //! A step of the current moves the voltages of all cells in the opposite direction, by the resistance times the step.
 //! The check judges each clear step between two steady levels of the voltages. The step is *explained* if the current
-//! has stepped in the opposite direction, and if the ratio of the two steps is plausible. This ratio is a resistance. It
-//! must lie between the usual resistance divided by [`MAX_FACTOR`] and the usual resistance times [`MAX_FACTOR`]. A step
-//! is the mean of two consecutive rounds minus the mean of the two rounds before them. Such a step contains less noise
-//! than the difference of two readings. A current that arrives one round earlier or later than the voltages still
-//! explains their step.
+//! has stepped in the opposite direction, and if the ratio of the two steps is a plausible resistance. A plausible
+//! resistance differs from the usual resistance by at most the factor [`MAX_FACTOR`]. To reduce noise, a step is the
+//! mean of two consecutive rounds minus the mean of the two rounds before them. A current that arrives one round
+//! earlier or later than the voltages still explains their step.
 //!
-//! Explained and unexplained steps are evidence for and against the sensor. How much they count depends on how many
-//! steps the sensor has left unexplained so far. If a sensor has explained all steps, one unexplained step makes the
-//! current doubtful: a wrong current falsifies the counted charge at once. A logger that reads current and voltages
-//! seconds apart leaves many steps unexplained, so one more is only weak evidence.
+//! Explained and unexplained steps are evidence for and against the sensor. If a sensor has explained all steps so far,
+//! one unexplained step makes the current doubtful, because a wrong current falsifies the counted charge at once. A
+//! logger that reads current and voltages seconds apart leaves many steps unexplained. A further unexplained step is
+//! then only weak evidence.
 //!
-//! The check finds a current that is frozen, inverted, late or beyond the sensor's range, whether or not the last
-//! digits of its readings change. While the load is constant, it finds only a noisy sensor at its limit ([`SensorLimit`]).
-//! A current without sign is found at the first clear steps of a charging current. If a doubted current has flowed in
-//! only one direction, the doubt ends only after the current has flowed in both. A current without sign therefore stays
+//! The check finds a current that is frozen, inverted, late or beyond the sensor's range, even if the last digits of
+//! its readings change. While the load is constant, it finds only a noisy sensor at its limit ([`SensorLimit`]). A
+//! current without sign is found at the first clear steps of a charging current. If a doubted current has flowed in
+//! only one direction, the doubt lasts until the current has flowed in both. A current without sign therefore stays
 //! doubtful.
 
 mod sensor_limit;
@@ -38,17 +36,17 @@ use crate::sample::CellSample;
 const FAULTY_SHARE: f64 = 0.7;
 /// Initial counts of unexplained and of explained steps, for a sensor without history.
 const FIRST_STEPS: [f64; 2] = [0.2, 20.0];
-/// Part of the counts that remains after another step.
+/// Factor on the earlier counts at each new step.
 const FORGET_STEP: f64 = 0.98;
 /// Largest share of unexplained steps that counts as usual for a good sensor.
 const MAX_USUAL_SHARE: f64 = 0.1;
-/// Evidence that makes the sensor doubtful, as ln of the odds against it.
+/// If the evidence exceeds this value (ln of the odds against the sensor), the current is doubtful.
 const DOUBTFUL: f64 = 4.0;
 /// Highest evidence. It limits how many steps a doubtful sensor must explain until the doubt ends.
 const MAX_EVIDENCE: f64 = 8.0;
-/// Largest movement of voltages and current just before and just after a step, as a part of the step.
+/// Largest movement of voltages and current just before and just after a step, as a fraction of the step.
 const STEADY: f64 = 0.3;
-/// Largest ratio of a step's resistance and the usual resistance, in either direction. Temperature, ageing and the time
+/// Largest ratio of a step's resistance to the usual resistance, or the reverse. Temperature, ageing and the time
 /// between two rounds change the resistance by less.
 const MAX_FACTOR: f64 = 4.0;
 /// Smallest clear step of the voltages (V).
@@ -59,37 +57,36 @@ const STEP_SIGMA: f64 = 5.0;
 const STEP_READINGS: f64 = 1.5;
 /// Smallest clear step, as a multiple of the usual change that the current does not explain.
 const STEP_MOVES: f64 = 9.0;
-/// Factor by which each round raises or lowers the usual unexplained change, which thus follows the median.
+/// Factor by which each round raises or lowers the usual unexplained change, so that it follows the median.
 const MOVE_GAIN: f64 = 1.02;
 /// Range of the usual unexplained change (V).
 const MOVE_V: (f64, f64) = (1e-4, 0.05);
 /// Usual unexplained change before the first rounds (V). It exceeds the noise of any sensor.
 const FIRST_MOVE_V: f64 = 0.01;
-/// Weight of an explained step in the usual resistance (as ln).
+/// Weight of an explained step in the average of ln(resistance).
 const RATIO_GAIN: f64 = 0.1;
 /// Longest time from the first to the last sample of a round (s). In a longer round, the cells were read at different
 /// currents.
 const MAX_ROUND_S: f64 = 1.0;
-/// A pause of this share of the time between the beginnings of two rounds ends a round: the frames of the next round
-/// follow.
+/// A pause of this share of the time between two round starts ends a round, because the next frames belong to the next
+/// round.
 const PAUSE_SHARE: f64 = 0.75;
 /// Longest time between two rounds (s). After a longer pause, the steps are not compared.
 const MAX_PAUSE_S: f64 = 60.0;
-/// Part of the earlier doubts that remains after an explained step.
+/// Factor on the number of earlier doubts at each explained step.
 const FORGET_DOUBT: f64 = 0.97;
 /// Weight of a round in the scatter of the cells.
 const SCATTER_GAIN: f64 = 0.02;
-/// Common change of the cells (V) after which a voltage that has not changed is frozen. The limit is at least
+/// Common change of the cells (V) after which an unchanged voltage counts as frozen. The limit is at least
 /// [`FROZEN_STEPS`] times the resolution of the voltages.
 const FROZEN_V: f64 = 0.03;
 const FROZEN_STEPS: f64 = 2.5;
-/// Resolution of the voltages before a change has been seen (V).
+/// Assumed resolution of the voltages before the first change (V).
 const COARSE_V: f64 = 0.05;
 /// Maximum number of cells that are compared.
 pub(crate) const MAX_CELLS: usize = 15;
 const ROUNDS: usize = 4;
 
-/// The round whose samples are arriving.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct OpenRound {
@@ -99,7 +96,6 @@ struct OpenRound {
     began: Option<Timestamp>,
     /// Time of the latest sample.
     time: Timestamp,
-    /// Current of the latest sample (A); `None` = unknown.
     latest_a: Option<f64>,
     /// Sum and number of the known currents of the samples (A).
     sum_a: f64,
@@ -125,12 +121,10 @@ impl OpenRound {
     }
 }
 
-/// A complete round.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Round {
     time: Timestamp,
-    /// Mean current of a cell (A).
     current_a: f64,
     /// Latest current of a cell (A).
     #[serde(default)]
@@ -139,7 +133,6 @@ struct Round {
     move_v: f64,
 }
 
-/// State of the check; part of the stored state.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct CurrentCheck {
@@ -206,8 +199,8 @@ impl Default for CurrentCheck {
 }
 
 impl CurrentCheck {
-    /// Whether the current is doubtful: the evidence is against it, or was against it and the current has never flowed
-    /// in both directions.
+    /// Whether the current is doubtful. It is doubtful while it is contradicted. After a contradiction, it stays
+    /// doubtful until it has flowed in both directions.
     pub(crate) fn is_doubtful(&self) -> bool {
         self.is_contradicted() || self.is_one_sided
     }
@@ -216,9 +209,9 @@ impl CurrentCheck {
         self.evidence > DOUBTFUL
     }
 
-    /// Handles a jump of the SOC in a downtime: the cells may have been used, or a sensor may have failed. The SOC
-    /// stays unconfirmed until a step of the current is explained. If no step has ever been judged, the SOC counts as
-    /// confirmed.
+    /// Demands an explained step of the current, because the SOC has jumped in a downtime. The cells may have been
+    /// used, or a sensor may have failed. Until the step is explained, the SOC is unconfirmed. If no step has ever been
+    /// judged, no step is demanded.
     fn demand_step(&mut self) {
         self.is_unconfirmed = self.steps != FIRST_STEPS;
     }
@@ -232,7 +225,7 @@ impl CurrentCheck {
         }
     }
 
-    /// Forgets the jumps, because all cells have reported.
+    /// Called when all cells have reported.
     pub(crate) fn forget_jumps(&mut self) {
         self.jumped = 0;
     }
@@ -242,9 +235,9 @@ impl CurrentCheck {
         self.is_unconfirmed
     }
 
-    /// Handles samples of a round, or of a part of it. `samples`: the compared cells that have reported, each with its
-    /// place (below [`MAX_CELLS`]). `noise_v`: standard deviation of a reading. `ohm`: the model's series resistance.
-    /// `rest_a`: largest current at rest.
+    /// Handles samples of a round, or of a part of a round. `samples`: the compared cells that have reported, each with
+    /// its place (below [`MAX_CELLS`]). `noise_v`: standard deviation of a reading. `ohm`: the model's series
+    /// resistance. `rest_a`: largest current at rest.
     pub(crate) fn handle<'a>(
         &mut self,
         samples: impl Iterator<Item = (usize, &'a CellSample)>,
@@ -254,7 +247,7 @@ impl CurrentCheck {
     ) {
         let mut has_samples = false;
         for (place, sample) in samples {
-            // A cell that was missing in the round before the latest one can report after the others.
+            // A late sample of a cell that is missing in the latest round still belongs to that round.
             let is_recent = |began: Timestamp| (0.0..MAX_ROUND_S).contains(&sample.time.since(began));
             if self.open.began.is_none() && self.voltages_v[place].is_none() && self.began.is_some_and(is_recent) {
                 self.voltages_v[place] = Some(sample.voltage_v);
@@ -324,8 +317,8 @@ impl CurrentCheck {
         self.path_v
     }
 
-    /// Whether the cells have clearly changed in common since the path was `path_v`. If a voltage has not changed
-    /// since, it is frozen.
+    /// Whether the voltages have clearly changed in common since [`Self::path_v`] had the value `path_v`. A voltage
+    /// that has not changed since then is frozen.
     pub(crate) fn is_frozen_since(&self, path_v: f64) -> bool {
         (self.path_v - path_v).abs() >= FROZEN_V.max(FROZEN_STEPS * self.resolution_v)
     }
@@ -353,8 +346,8 @@ impl CurrentCheck {
         if is_explained {
             self.log_ratio = (self.log_ratio + RATIO_GAIN * libm::log(factor)).clamp(-2.0, 2.0);
         }
-        // A current that changes all the time may have been read at another moment than the voltages. An unexplained
-        // step then does not count.
+        // A current that changes all the time may have been read at another moment than the voltages. In this case, an
+        // unexplained step does not count.
         if is_explained || is_steady(ohm * before_a, ohm * after_a) {
             self.weigh(is_explained);
         }
@@ -392,7 +385,6 @@ impl CurrentCheck {
         self.limit.pause();
     }
 
-    /// Checks a stored state; the error is the first impossible number.
     pub(crate) fn check(&self) -> Result<(), InvalidState> {
         let voltages_v = self.voltages_v.into_iter().chain(self.open.voltages_v).flatten();
         bounds::VOLTAGE_V.check_all("a voltage of the check of the current", voltages_v)?;
@@ -419,7 +411,6 @@ impl CurrentCheck {
         InvalidState::unless(self.count <= ROUNDS, "rounds of the check of the current", self.count as f64, "at most 4")
     }
 
-    /// Shifts all timestamps by `by_nanos`, to another clock.
     pub(crate) fn rebase(&mut self, by_nanos: i64) {
         self.began = self.began.map(|began| began.plus_nanos(by_nanos));
         self.open.began = self.open.began.map(|began| began.plus_nanos(by_nanos));

@@ -30,14 +30,12 @@ struct BusState {
     unsent: Option<(Timestamp, Timestamp)>,
 }
 
-/// State of all interfaces that have reported.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub(crate) struct Buses {
     states: Vec<BusState>,
 }
 
 impl Buses {
-    /// Handles a report of an interface.
     pub(crate) fn handle_event(&mut self, now: Timestamp, bus: BusIndex, event: BusEvent) {
         let state = self.state(bus);
         state.is_known = true;
@@ -71,7 +69,6 @@ impl Buses {
         (worst_s, known.count() >= interfaces)
     }
 
-    /// Shifts stored timestamps to another clock.
     pub(crate) fn rebase(&mut self, by_nanos: i64) {
         let moved = |stamp: Timestamp| stamp.plus_nanos(by_nanos);
         for state in &mut self.states {

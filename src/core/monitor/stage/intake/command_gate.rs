@@ -1,15 +1,16 @@
 //! Decides which authenticated command frames are executed.
 //!
-//! In: a command frame, and the freshness that its authenticator confirms, if any. Out: permission to execute the
-//! command, or the reason for the refusal; the freshness to announce.
+//! In: a command frame, and the freshness (counter value) for which its authenticator is correct, if any. Out:
+//! permission to execute the command, or the reason for the refusal; the freshness to announce.
 //!
 //! With many attempts, an attacker can guess a short authenticator. After [`FORGED_BURST`] wrong authenticators, the
-//! gate is *under attack* for [`FORGED_PERIOD_NS`]. After that, each further wrong authenticator starts another such
-//! period. For every [`FORGED_PERIOD_NS`] without a wrong authenticator, one more is tolerated again.
+//! gate is *under attack* for [`FORGED_PERIOD_NS`]. After this period, each further wrong authenticator starts another
+//! period. For every [`FORGED_PERIOD_NS`] without a wrong authenticator, the gate tolerates one more wrong
+//! authenticator.
 //!
-//! During an attack, a command with a right authenticator is executed only after it has been sent again within
-//! [`REPEAT_NS`], with another freshness. A genuine sender repeats a refused command, so its commands are executed even
-//! during an attack. An attacker must guess right twice.
+//! During an attack, a command with a right authenticator is executed only if it is sent again within [`REPEAT_NS`],
+//! with another freshness. A genuine sender repeats a refused command, so its commands are executed even during an
+//! attack. An attacker must guess right twice.
 
 use serde::{Deserialize, Serialize};
 
@@ -19,22 +20,21 @@ use crate::quantity::{InvalidState, Timestamp};
 
 /// Number of wrong authenticators tolerated after a pause.
 const FORGED_BURST: i64 = 10;
-/// Time after which one more wrong authenticator is tolerated, ns. The probability of guessing an authenticator of 24
-/// bits within a day is then 1 in 1900.
+/// Time after which one more wrong authenticator is tolerated, ns. The probability that an attacker guesses an
+/// authenticator of 24 bits within a day is then 1 in 1900.
 const FORGED_PERIOD_NS: i64 = 10_000_000_000;
 /// Longest time between a command and its repetition during an attack, ns. At 2000 guesses a second (the default flood
-/// limit), the probability of guessing an authenticator of 24 bits and its repetition within a day is 1 in 800.
+/// limit), the probability is 1 in 800 that an attacker guesses an authenticator of 24 bits and its repetition within a
+/// day.
 const REPEAT_NS: i64 = 1_000_000_000;
 
 /// Age, ns, at which an announced freshness is outdated. It is two announcement periods.
 const STALE_NS: i64 = 2 * FRESHNESS_PERIOD_MS as i64 * 1_000_000;
 
-/// The gate with its counts. The whole structure is stored.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct CommandGate {
     window: FreshnessWindow,
-    /// Time of the last announcement of the freshness.
     announced_at: Timestamp,
     /// End of the time under attack, in which commands must be repeated.
     attacked_until: Timestamp,
@@ -70,7 +70,6 @@ impl CommandCounts {
 }
 
 impl CommandGate {
-    /// Starts a run at `now`.
     pub(crate) fn begin(&mut self, now: Timestamp) {
         self.window.begin(now);
         self.announced_at = now;
@@ -83,18 +82,16 @@ impl CommandGate {
         self.unconfirmed = None;
     }
 
-    /// The freshness to announce next.
     pub(crate) fn announce(&mut self, now: Timestamp) -> u64 {
         self.announced_at = now;
         self.window.announce()
     }
 
-    /// The data needed to check a payload's authenticator.
     pub(crate) fn mac_check(&self, authentication: Authentication, payload: &[u8]) -> MacCheck {
         self.window.check(authentication, payload)
     }
 
-    /// Judges a frame. `verified`: the freshness that its authenticator confirms.
+    /// Judges a frame. `verified`: the freshness for which its authenticator is correct.
     ///
     /// # Errors
     /// The reason why the command is not executed.
@@ -131,7 +128,6 @@ impl CommandGate {
         verdict
     }
 
-    /// Shifts stored times to another clock.
     pub(crate) fn rebase(&mut self, by_nanos: i64) {
         self.announced_at = self.announced_at.plus_nanos(by_nanos);
         self.attacked_until = self.attacked_until.plus_nanos(by_nanos);

@@ -1,9 +1,9 @@
-//! Remaining useful life: half-cycles update each cell's forecast. The pack has the remaining life of the cell whose
-//! life is shortest.
+//! Remaining useful life: each half-cycle updates the forecasts of the cells. The remaining life of the pack is the
+//! shortest remaining life of its cells.
 //!
 //! A forecast uses the capacity measured by each single half-cycle, not the learned capacity, because successive
-//! learned capacities share most of their evidence. The error that all half-cycles share (the current sensor's gain)
-//! enters as the shared variance.
+//! learned capacities share most of their evidence. All half-cycles share the error of the current sensor's gain. This
+//! error enters the forecast as the shared variance.
 
 use crate::alarm::{Observation, Rule};
 use crate::cell::{CellModel, PackBank};
@@ -18,7 +18,6 @@ use crate::quantity::CellIndex;
 /// Number of standard deviations between the median and the 5 % quantile of a normal distribution.
 const LOW_DEVIATIONS: f64 = 1.645;
 
-/// A cell's forecast and its latest result.
 #[derive(Debug, Clone)]
 pub(crate) struct CellLife {
     pub(crate) forecast: Forecast,
@@ -30,7 +29,6 @@ impl CellLife {
         Self::restore(Forecast::new(Axis::Cycles, model.rated_capacity_ah), config)
     }
 
-    /// Restores a stored forecast.
     pub(crate) fn restore(forecast: Forecast, config: &HealthConfig) -> Self {
         let remaining = forecast.remaining(config.end_of_life_ah);
         Self { forecast, remaining }
@@ -75,7 +73,6 @@ impl CellLife {
     }
 }
 
-/// The remaining lives of all cells.
 #[derive(Debug)]
 pub(crate) struct PackLife {
     pub(crate) cells: Vec<CellLife>,
@@ -86,7 +83,6 @@ impl PackLife {
         Self { cells: (0..bank.cells()).map(|cell| CellLife::new(bank.model(cell), config)).collect() }
     }
 
-    /// Remaining life of a cell, or the reason why it is unknown.
     pub(crate) fn of_cell(&self, cell: CellIndex) -> Result<RemainingLife, InsufficientData> {
         self.cells.get(cell.index()).map_or(Err(InsufficientData::Readings { found: 0 }), |cell| cell.remaining)
     }

@@ -1,16 +1,16 @@
 //! Counts the charge and the energy that a pack takes up and delivers while the program runs.
 //!
 //! In: pack current (A, positive = discharge) and pack voltage (V). Out: sums in both directions, which never decrease.
-//! Time without a current is not counted. The voltage is read once a second, and the energy is this voltage times the
-//! charge since the last reading. While the voltage is unknown, the charge waits for the next known voltage.
+//! Time with an unknown current is not counted. The voltage is read once a second, and the energy is this voltage times
+//! the charge since the last reading. While the voltage is unknown, the charge waits for the next known voltage.
 
 use serde::{Deserialize, Serialize};
 
 use crate::quantity::{InvalidState, Timestamp};
 
-/// Time between two voltages (s).
+/// Shortest time between two readings of the voltage (s).
 const VOLTAGE_PERIOD_S: f64 = 1.0;
-/// Longest time between two currents over which the current is counted (s).
+/// Longest time between two current readings over which charge is counted (s).
 const LONGEST_S: f64 = 60.0;
 
 /// Charge and energy moved since the program first ran with the pack.
@@ -59,7 +59,7 @@ impl MovedCounter {
         self.waiting_s = 0.0;
     }
 
-    /// The same sums after a time of unknown length.
+    /// Keeps the sums. The time until the next current is not counted.
     pub(crate) fn interrupted(&self) -> Self {
         Self { latest: None, ..*self }
     }
@@ -72,7 +72,6 @@ impl MovedCounter {
             .try_for_each(|sum| InvalidState::unless_natural("the charge and energy moved", sum))
     }
 
-    /// Shifts the time by `by_nanos`, to another clock.
     pub(crate) fn rebase(&mut self, by_nanos: i64) {
         self.latest = self.latest.map(|latest| latest.plus_nanos(by_nanos));
     }
@@ -101,7 +100,7 @@ mod tests {
         };
         close(drive(0, 36_000, Some(10.0), Some(400.0)), [0.0, 10.0, 0.0, 4000.0]);
         close(drive(36_001, 54_000, Some(-10.0), Some(420.0)), [5.0, 10.0, 2100.0, 4000.0]);
-        // An unknown current moves nothing known. While the voltage is unknown, the charge waits.
+        // No charge is counted while the current is unknown. While the voltage is unknown, the charge waits.
         close(drive(54_001, 56_000, None, Some(420.0)), [5.0, 10.0, 2100.0, 4000.0]);
         close(drive(56_001, 92_000, Some(1.0), None), [5.0, 11.0, 2100.0, 4000.0]);
         close(drive(92_001, 92_010, Some(0.0), Some(400.0)), [5.0, 11.0, 2100.0, 4400.0]);

@@ -1,12 +1,13 @@
-//! Decides which alarm is sent next. A changed alarm is sent immediately and then repeated. All raised alarms are also
-//! sent *in turn*: one after another, each once per period if the budget allows. All frames share this budget.
+//! Decides which alarm is sent next. In: changed alarms, the alarm engine, the time. Out: one alarm at a time, most
+//! severe first.
 //!
-//! In: changed alarms, the alarm engine, the time. Out: one alarm at a time, most severe first. The budget is a token
-//! bucket: [`BURST`] frames at once, then one every [`ALARM_DELAY_MS`]. The first frames of changes have priority over
-//! frames in turn, which use at most half of the budget. Repetitions have the lowest priority.
+//! A changed alarm is sent at once and then repeated. In addition, all raised alarms are sent *in turn*, one after
+//! another, each once per period. All frames share one budget, a token bucket: [`BURST`] frames at once, then one frame
+//! every [`ALARM_DELAY_MS`]. The first frames of changes have the highest priority. Frames in turn come next, and use
+//! at most half of the budget. Repetitions have the lowest priority.
 //!
 //! Deviation: a frame shows the alarm's state at the time of sending, not at each change. Effect: if an alarm changes
-//! twice while the budget is used up, the receiver sees only the second change.
+//! twice while the budget is used up, the receiver gets only the second change.
 
 use std::cmp::Reverse;
 
@@ -16,13 +17,13 @@ use crate::alarm::{Alarm, AlarmEngine, AlarmState, Rule, Severity};
 use crate::can::encode::{ALARM_DELAY_MS, CHANGE_REPETITION_MS, CHANGE_REPETITIONS};
 use crate::quantity::{CellIndex, Timestamp};
 
-/// Number of immediate frames after a pause. One event usually changes fewer alarms: the alarms of a few cells, or one
-/// alarm per module.
+/// Number of frames that may be sent at once after a pause. One event usually changes fewer alarms, for example the
+/// alarms of a few cells or of all modules.
 const BURST: i64 = 20;
 /// Shortest time between frames in turn, in units of [`ALARM_DELAY_MS`]. Half of the budget thus remains for changes.
 const TURN_DELAYS: u32 = 2;
-/// Maximum number of alarms that are announced as unknown. 18 rules with three severities have 54 thresholds. Further
-/// unknown alarms are not announced, but the digest shows their rules as unknown.
+/// Maximum number of alarms that are announced as unknown: more than the 54 thresholds (18 rules, three severities).
+/// Further unknown alarms are not announced, but the digest shows their rules as unknown.
 const MAX_UNKNOWN: usize = 64;
 
 const NANOS_PER_MS: i64 = 1_000_000;
@@ -46,7 +47,6 @@ impl AlarmKey {
         Self::new(alarm.rule, alarm.severity, alarm.cell)
     }
 
-    /// Rule, severity and cell.
     pub(crate) fn parts(self) -> (Rule, Severity, Option<CellIndex>) {
         (self.rule, self.severity.0, self.cell)
     }
@@ -62,7 +62,6 @@ struct ChangedAlarm {
     key: AlarmKey,
     /// Number of frames left to send.
     frames: u32,
-    /// Time of the next frame.
     due: Timestamp,
 }
 
@@ -72,7 +71,6 @@ impl ChangedAlarm {
     }
 }
 
-/// Queue of alarms to send; the module documentation describes the order.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub(crate) struct AlarmQueue {
     /// Changed alarms, most severe first; each alarm at most once.
@@ -88,19 +86,18 @@ pub(crate) struct AlarmQueue {
 }
 
 impl AlarmQueue {
-    /// Whether any alarm is announced as unknown.
     pub(crate) fn has_unknown(&self) -> bool {
         !self.unknown.is_empty()
     }
 
-    /// Time between two frames in turn of the same raised alarm (s).
+    /// Time in which every raised alarm is sent once in turn (s).
     pub(crate) fn pass_time_s(engine: &AlarmEngine, period_s: f64) -> f64 {
         let count = i64::try_from(engine.count()).unwrap_or(i64::MAX).max(1);
         Timestamp::from_nanos(Self::turn_ns(engine, period_s).saturating_mul(count)).secs()
     }
 
-    /// Time between two frames in turn, ns. This time is short enough to send all raised alarms in each period, unless
-    /// the budget requires more time.
+    /// Time between two frames in turn (ns). All raised alarms are sent in each period, unless the budget requires more
+    /// time.
     fn turn_ns(engine: &AlarmEngine, period_s: f64) -> i64 {
         let period_ns = Timestamp::ZERO.plus_secs(period_s).nanos().max(1);
         let count = i64::try_from(engine.count()).unwrap_or(i64::MAX).max(1);
@@ -108,7 +105,7 @@ impl AlarmQueue {
         period_ns.saturating_add(count - 1).checked_div(count).unwrap_or(period_ns).max(least_ns)
     }
 
-    /// Adds a changed alarm, which will be sent immediately and repeated.
+    /// Schedules a changed alarm, which is sent at once and repeated.
     pub(crate) fn note_change(&mut self, now: Timestamp, key: AlarmKey) {
         let entry = ChangedAlarm { key, frames: 1 + CHANGE_REPETITIONS, due: now };
         match self.changed.binary_search_by_key(&key, |changed| changed.key) {
@@ -144,7 +141,7 @@ impl AlarmQueue {
         Some(key)
     }
 
-    /// The raised alarm whose turn has come.
+    /// The next raised alarm in turn, if its frame is due.
     fn take_turn(&mut self, now: Timestamp, engine: &AlarmEngine, period_s: f64) -> Option<AlarmKey> {
         if engine.count() == 0 {
             self.turn = None;
@@ -155,7 +152,7 @@ impl AlarmQueue {
         if due > now || self.free > now {
             return None;
         }
-        // Skips missed turns, except the few that a late tick causes.
+        // Makes up for the few turns that a late tick misses, but not for a longer pause.
         let earliest = now.plus_nanos(-BURST * DELAY_NS);
         self.turn = Some(due.max(earliest).plus_nanos(step_ns));
         let keys = || engine.raised().map(|alarm| AlarmKey::of(&alarm));
@@ -186,7 +183,7 @@ impl AlarmQueue {
         Some(alarm)
     }
 
-    /// Adds a change for each alarm that was announced as unknown and is known again.
+    /// Schedules a change for each alarm that was announced as unknown and is known again.
     pub(crate) fn note_known(&mut self, now: Timestamp, engine: &AlarmEngine) {
         let is_open = |key: &AlarmKey| {
             let state = key.find(engine).map(|alarm| alarm.state);
@@ -198,7 +195,6 @@ impl AlarmQueue {
         }
     }
 
-    /// Takes one frame from the budget.
     fn pay(&mut self, now: Timestamp) {
         self.free = self.free.max(now.plus_nanos(-(BURST - 1) * DELAY_NS)).plus_nanos(DELAY_NS);
     }
@@ -228,9 +224,9 @@ impl AlarmQueue {
         self.changed.iter_mut().for_each(|changed| changed.due = changed.due.min(now));
     }
 
-    /// Limits every due time of a state stored at `stored` to the due time that would follow from a frame sent at
-    /// `now`. If time has passed since then, the budget starts used up, because an earlier process may have sent a burst
-    /// just before its end.
+    /// Limits each due time of a state that was stored at `stored` to one period after `now`. If time has passed since
+    /// the state was stored, the budget is used up at first, because an earlier process may have sent a burst just
+    /// before its end.
     pub(crate) fn limit(&mut self, stored: Timestamp, now: Timestamp, period_s: f64) {
         let least = if stored < now { now.plus_nanos(DELAY_NS) } else { self.free };
         self.free = least.min(now.plus_nanos(DELAY_NS));
@@ -243,14 +239,12 @@ impl AlarmQueue {
         self.free = now.plus_nanos(DELAY_NS);
     }
 
-    /// Shifts stored times to another clock.
     pub(crate) fn rebase(&mut self, by_nanos: i64) {
         self.free = self.free.plus_nanos(by_nanos);
         self.turn = self.turn.map(|turn| turn.plus_nanos(by_nanos));
         self.changed.iter_mut().for_each(|changed| changed.due = changed.due.plus_nanos(by_nanos));
     }
 
-    /// Empties the queue.
     pub(crate) fn clear(&mut self) {
         *self = Self::default();
     }

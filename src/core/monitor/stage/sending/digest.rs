@@ -1,7 +1,7 @@
 //! Computes the contents of the digest frame: a summary of all raised alarms, the state of every rule, and one
 //! threshold. Successive digests show the thresholds one after another.
 //!
-//! In: the alarm engine. Out: [`DigestFields`]. A rule that cannot be judged is shown as unknown, never as "no alarm".
+//! In: the alarm engine. Out: [`DigestFields`]. If a rule cannot be judged, its state is unknown, never "no alarm".
 
 use super::alarm_queue::AlarmQueue;
 use crate::alarm::{AlarmEngine, Rule, RuleSummary, Severity};

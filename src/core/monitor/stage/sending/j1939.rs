@@ -1,9 +1,9 @@
 //! The J1939 node, which sends alarms as trouble codes in addition to the frames of `[output]`.
 //!
 //! In: frames of the node's interface, alarms, ticks. Out: the node's frames and events. If several raised thresholds
-//! of a rule share a suspect parameter number (SPN), the node sends only the trouble code of the most severe threshold.
-//! If several raised rules share an SPN, only the rule with the highest number is sent. The occurrence count of a code
-//! is the largest count among the threshold's alarms.
+//! of a rule share a suspect parameter number (SPN), the node sends only the code of the most severe threshold. If
+//! several raised rules share an SPN, the node sends only the rule with the highest number. The occurrence count of a
+//! code is the largest count among the threshold's alarms.
 
 use crate::alarm::AlarmEngine;
 use crate::can::Frame;
@@ -12,7 +12,6 @@ use crate::monitor::config::{AlarmCode, J1939Config};
 use crate::monitor::message::{Event, EventKind, Outputs, Transmit};
 use crate::quantity::{BusIndex, Timestamp};
 
-/// The node, and the trouble codes that it sends.
 #[derive(Debug)]
 pub(crate) struct J1939 {
     config: J1939Config,
@@ -52,7 +51,6 @@ impl J1939 {
         self.dispatch_outputs(now, out);
     }
 
-    /// Handles a frame if it was received on the node's interface.
     pub(crate) fn handle_frame(&mut self, now: Timestamp, bus: BusIndex, frame: &Frame, out: &mut Outputs) {
         if bus == self.config.bus {
             self.node.handle_frame(now, frame, &mut self.out);
@@ -69,7 +67,7 @@ impl J1939 {
     pub(crate) fn update_trouble_codes(&mut self, now: Timestamp, engine: &AlarmEngine, is_test_running: bool) {
         self.active.clear();
         self.previously_active.clear();
-        // Within a rule, thresholds are ordered by severity; the most severe comes last.
+        // Within a rule, the thresholds are ordered by increasing severity.
         for threshold in engine.thresholds().rev() {
             let same = |code: &&AlarmCode| (code.rule, code.severity) == (threshold.rule, threshold.severity);
             let Some(own) = self.config.alarms.iter().find(same) else { continue };
@@ -82,7 +80,7 @@ impl J1939 {
                 self.previously_active.push(code);
             }
         }
-        // Restores the order of rule and severity. If the list is too long, its end is cut off.
+        // Restores the order by rule and severity, because the end of a list that is too long is cut off.
         self.previously_active.reverse();
         if is_test_running {
             self.active.push(ActiveCode { code: self.config.test_code, lamp: Lamp::None });

@@ -1,4 +1,4 @@
-//! When the frames are due, their counters, and what a restart or a sleep changes.
+//! Due times and counters of the cyclic frames, and how a restart or a sleep changes them.
 
 use serde::{Deserialize, Serialize};
 
@@ -7,15 +7,14 @@ use crate::can::encode::{FRESHNESS_PERIOD_MS, SendCounters};
 use crate::monitor::config::OutputConfig;
 use crate::quantity::Timestamp;
 
-/// Number of freshness values skipped at a start. An earlier process may have sent this many frames after its state was
-/// stored: the driver stores the state before the first frame and after every half of these values. The value is so
-/// small that 300 starts a day do not overtake [`FRESHNESS_PER_S`].
+/// Number of freshness values skipped at a start, because an earlier process may have sent frames after its state was
+/// stored. The driver stores the state before the first frame, and again when half of these values have been used. With
+/// up to 300 starts a day, the freshness stays below the clock's value ([`FRESHNESS_PER_S`]).
 pub const RESTART_FRESHNESS: u64 = 1 << 16;
-/// At a start, the freshness is at least this value times the clock's time in seconds. The value exceeds the number of
-/// frames in a second.
+/// At a start, the freshness is at least this value times the clock's time in seconds. The daemon sends fewer frames
+/// than this per second.
 const FRESHNESS_PER_S: u64 = 256;
 
-/// Due times of the cyclic work.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub(crate) struct Schedule {
     pub(super) housekeeping: Timestamp,
@@ -39,14 +38,13 @@ pub(crate) struct Schedule {
     /// Whether cyclic frames are omitted, because the buses sleep.
     #[serde(default)]
     pub(super) is_quiet: bool,
-    /// Cyclic frames are sent until this time, even if the buses sleep. After a restart, the program must first observe
-    /// the silence itself.
+    /// Cyclic frames are sent until this time, even if the buses sleep. A restarted program must first observe the
+    /// silence itself.
     #[serde(default)]
     pub(super) quiet_from: Timestamp,
 }
 
 impl Schedule {
-    /// Shifts stored times to another clock.
     pub(crate) fn rebase(&mut self, by_nanos: i64) {
         for due in self.dues() {
             *due = due.plus_nanos(by_nanos);
@@ -55,7 +53,6 @@ impl Schedule {
         self.alarms.rebase(by_nanos);
     }
 
-    /// Due times of all cyclic work.
     fn dues(&mut self) -> [&mut Timestamp; 6] {
         let Self { housekeeping, status, health, alarm, digest, freshness, .. } = self;
         [housekeeping, status, health, alarm, digest, freshness]
@@ -73,7 +70,6 @@ impl Schedule {
         }
     }
 
-    /// Makes all cyclic work due now.
     pub(super) fn restart(&mut self, now: Timestamp) {
         self.is_quiet = false;
         self.dues().into_iter().for_each(|due| *due = now);
@@ -81,12 +77,12 @@ impl Schedule {
         self.alarms.restart(now);
     }
 
-    /// After a restart: a sleep that the program has not seen yet omits no frames before `time`.
+    /// After a restart, ensures that cyclic frames are sent until `time`.
     pub(crate) fn set_quiet_from(&mut self, time: Timestamp) {
         self.quiet_from = time;
     }
 
-    /// The clock was set back by `seconds`.
+    /// Moves `quiet_from` after the clock was set back by `seconds`.
     pub(crate) fn step_back(&mut self, seconds: f64) {
         self.quiet_from = self.quiet_from.plus_secs(-seconds);
     }
@@ -109,7 +105,6 @@ impl Schedule {
         due.map(|is_due| is_due && !self.is_quiet)
     }
 
-    /// Whether the frame that announces the freshness for commands is due.
     pub(super) fn take_freshness_due(&mut self, now: Timestamp) -> bool {
         take_due(&mut self.freshness, now, f64::from(FRESHNESS_PERIOD_MS) / 1000.0) && !self.is_quiet
     }

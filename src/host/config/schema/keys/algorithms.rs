@@ -93,8 +93,8 @@ section! {
 }
 
 impl Estimator {
-    /// Standard deviation of the voltage's rounding error (V) (uniform: step / sqrt 12). If the step does not exceed
-    /// the sensor's noise, the result is 0, because the noise then covers the rounding error.
+    /// Standard deviation of the voltage's rounding error (V): step / sqrt(12), because the error is uniform. The
+    /// result is 0 if the step does not exceed the sensor's noise, because the noise then covers the rounding error.
     pub(crate) fn rounding_v(&self, step_v: f64) -> f64 {
         if step_v > self.voltage_noise_v { step_v / 12.0_f64.sqrt() } else { 0.0 }
     }
@@ -153,7 +153,7 @@ impl Estimator {
             },
             sensor: match self.capacity_state {
                 CapacityState::Joint => SensorErrors {
-                    // At rest all readings have the same rounding error.
+                    // At rest all readings have the same rounding error, so it acts as an offset.
                     voltage_offset_v: self.voltage_offset_std_v.hypot(rounding_v).hypot(spread.curve_v),
                     current_offset_a: capacity.current_offset_std_a,
                     current_gain: capacity.current_gain_std,
@@ -188,7 +188,6 @@ section! {
 }
 
 impl Transition {
-    /// The dead band, or its default: C/50 of the pack.
     fn dead_band_a(&self, pack_ah: f64) -> f64 {
         self.dead_band_a.unwrap_or(pack_ah / 50.0)
     }
@@ -238,8 +237,7 @@ impl Capacity {
         }
     }
 
-    /// Standard deviation of the open-circuit curve's ageing shift; 0 for method "nominal", which does not use the
-    /// shift.
+    /// Standard deviation of the open-circuit curve's ageing shift; 0 for method "nominal", which ignores the shift.
     pub(crate) fn shift_std(&self) -> f64 {
         match self.method {
             MethodKey::Swing => self.ageing_shift_error,

@@ -14,7 +14,6 @@ pub(crate) const TEMPERATURE_C: ValueRange = within(bounds::TEMPERATURE_C);
 /// Range of standard deviations and of noise densities.
 pub(crate) const DEVIATION: ValueRange = within(bounds::DEVIATION);
 
-/// Which way a positive current flows on the bus.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum PositiveCurrent {
     /// Into the pack.
@@ -23,36 +22,36 @@ pub(crate) enum PositiveCurrent {
     Discharge,
 }
 
-/// Which source addresses of J1939 carry a message of a DBC.
+/// Which J1939 source addresses may send a message of a DBC file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum SourceAddress {
-    /// Any address if the DBC says that the message is a J1939 parameter group, else the address in the DBC.
+    /// Any address if the DBC file marks the message as a J1939 parameter group, else the address in the DBC file.
     Auto,
     /// Any address, for every extended identifier.
     Any,
-    /// The address in the DBC.
+    /// The address in the DBC file.
     Exact,
 }
 
-/// Which byte of a number comes first.
+/// Byte order of a number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum WireOrder {
-    /// The most significant byte.
+    /// The most significant byte first.
     Big,
-    /// The least significant byte.
+    /// The least significant byte first.
     Little,
 }
 
-/// How the capacity follows from the charge of a half-cycle.
+/// How the capacity is computed from the charge of a half-cycle.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum MethodKey {
-    /// Charge divided by the SOC swing, which follows from the voltages.
+    /// Charge divided by the SOC swing, which is computed from the voltages.
     Swing,
     /// Charge divided by a configured swing.
     Nominal,
 }
 
-/// End-to-end protection of a frame: the AUTOSAR profile; `None` = off.
+/// AUTOSAR end-to-end protection profile of a frame; `None` = unprotected.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct E2eKey(pub Option<Profile>);
 

@@ -103,7 +103,7 @@ section! {
     }
 }
 
-/// Declares a table that names a signal on a bus, with the keys that all these tables share.
+/// Declares a table that names a signal on a bus. All tables of this macro share the keys below.
 macro_rules! signal_section {
     ($(#[doc = $about:literal])+ $name:ident at $path:literal, $unit:literal { $($keys:tt)* }) => {
         section! {
@@ -128,11 +128,9 @@ macro_rules! signal_section {
 /// The keys that all signal tables share.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct SignalSource<'a> {
-    /// Place in the file.
     pub place: &'a TablePlace,
-    /// `Message.Signal`, or a pattern.
+    /// `Message.Signal`, or a pattern of such names.
     pub signal: &'a str,
-    /// Interface name, if given.
     pub interface: Option<&'a str>,
     /// Factor from the DBC's unit to packwatch's unit.
     pub scale: f64,

@@ -1,4 +1,4 @@
-//! Declares the tables of plausible readings, `[limits.*]`, which give the [`Limits`] of the sample stage.
+//! Declares the tables `[limits.*]`. They give the [`Limits`] of plausible readings.
 
 use super::choices::TEMPERATURE_C;
 use crate::cell::CellModel;

@@ -67,7 +67,6 @@ section! {
 /// The keys that all tables of sent frames share.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct FrameKeys<'a> {
-    /// Place of the table in the file.
     pub place: &'a TablePlace,
     /// CAN identifier; `None` = the DBC's.
     pub id: Option<u32>,
@@ -87,7 +86,7 @@ pub(crate) struct FrameKeys<'a> {
     pub data_id: Option<u16>,
 }
 
-/// Declares the table of a sent frame, with the keys that all these tables share.
+/// Declares the table of a sent frame with the keys of [`FrameKeys`].
 macro_rules! frame_section {
     ($(#[doc = $about:literal])+ $name:ident at $path:literal) => {
         section! {

@@ -1,4 +1,4 @@
-//! Tests of the candump parser: every form of a line, every byte at every place, and random lines.
+//! Tests the candump parser with every form of a line, every byte at every place, and random lines.
 
 use proptest::prelude::*;
 
@@ -7,9 +7,9 @@ use super::*;
 /// Text that follows the line in the log.
 const MORE: &str = "\n(1700000000.123456) can0 123#1122334455667788\n(1700000000.123457) can0 123#\n";
 
-/// Reads the line twice with a parser that knows the interface and sees more text after the line. In the second pass,
-/// the parser also remembers the seconds of the stamp. Both results must equal the result of a new parser, which reads
-/// only this line and takes no fast path.
+/// Parses the line twice with a parser that knows the interface and is given more text after the line. In the second
+/// pass, the parser also remembers the seconds of the stamp. Both results must equal that of a new parser, which
+/// parses only this line and takes no fast path.
 fn read(line: &[u8]) -> Result<Line<'_>, LineError> {
     let plain = crate::io::candump::parse_line(line);
     let name = match plain {
@@ -43,7 +43,7 @@ fn digit() -> impl Strategy<Value = u8> {
     prop::sample::select(b"0123456789ABCDEFabcdef".to_vec())
 }
 
-/// Usual lines. The lengths of their parts vary.
+/// Usual lines with parts of different lengths.
 fn usual_line() -> impl Strategy<Value = Vec<u8>> {
     let stamp = (0..9_223_371_999u64, prop_oneof!["[0-9]{6}", "[0-9]{9}"]);
     let id = prop_oneof!["[0-7][0-9A-Fa-f]{2}", "[01][0-9A-Fa-f]{7}"];

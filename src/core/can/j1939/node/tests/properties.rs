@@ -17,7 +17,7 @@ enum Act {
 }
 
 fn act() -> impl Strategy<Value = Act> {
-    // Identifiers that concern the node occur more often than in a random choice.
+    // Identifiers that concern the node are chosen more often.
     let id = prop_oneof![
         Just(0x18EE_FFF9_u32),
         Just(0x18EA_F921),
@@ -49,8 +49,7 @@ fn lamp_of(number: u8) -> Lamp {
 fn perform(bench: &mut Bench, act: &Act) {
     match act {
         Act::Wait(ms) => {
-            // Simulates a driver that sleeps until something is due. It polls at most once a tick (here 1 ms), as a
-            // driver does that polls at every tick.
+            // Simulates a driver that sleeps until something is due, but polls at most once a tick (here 1 ms).
             let (end, mut next_tick) = (bench.now_ms + i64::from(*ms), bench.now_ms);
             while let Some(due) = bench.node.next_due().filter(|due| *due <= at(end) && next_tick <= end) {
                 bench.now_ms = next_tick.max(due.nanos().saturating_add(999_999) / 1_000_000);
@@ -82,8 +81,7 @@ fn perform(bench: &mut Bench, act: &Act) {
     bench.take();
 }
 
-/// Gives the same inputs to two nodes. The first node is polled only when something is due, the second node every
-/// millisecond.
+/// Gives the same inputs to two nodes. The first is polled only when something is due, the second every millisecond.
 fn sleeping_and_polled(acts: &[Act]) -> (Bench, Bench) {
     let (mut sleeper, mut busy) = (Bench::new(), Bench::new());
     for act in acts {
@@ -102,8 +100,7 @@ fn sleeping_and_polled(acts: &[Act]) -> (Bench, Bench) {
     (sleeper, busy)
 }
 
-/// A case that the property below found. During the transfer of a DM2, both codes leave the DM1, which then fits into
-/// one frame.
+/// During the transfer of a DM2, both codes leave the DM1, which then fits into one frame.
 #[test]
 fn dm1_shortened_during_transfer_is_due() {
     let set = |spns: &[(u8, u8)], previously| Act::Set { spns: spns.to_vec(), previously, all_known: true };
@@ -119,7 +116,7 @@ fn dm1_shortened_during_transfer_is_due() {
 proptest! {
     #![proptest_config(ProptestConfig { cases: 128, ..ProptestConfig::default() })]
 
-    /// A driver may skip every poll before the due time. A replay skips them; a live daemon does not.
+    /// A replay skips all polls before the due time; a live daemon does not. Both must give the same frames.
     #[test]
     fn polls_before_due_time_change_nothing(acts in proptest::collection::vec(act(), 1..60)) {
         let (sleeper, busy) = sleeping_and_polled(&acts);
@@ -141,7 +138,7 @@ proptest! {
                 prop_assert!(is_claim || !claims_only, "{frame:?} from a silent node");
                 prop_assert!(sent_ids.contains(&frame.id()));
             }
-            // A driver that sleeps until something is due neither spins nor sleeps forever.
+            // The driver must neither spin nor sleep forever.
             bench.node.poll(at(bench.now_ms), &mut bench.out);
             bench.take();
             if let Some(due) = bench.node.next_due() {

@@ -1,19 +1,20 @@
-//! Sigma points in pairs: columns of the Cholesky factor, and odd and even parts of a function over each pair.
+//! Computes sigma points in pairs: the columns of the Cholesky factor, and the odd and even parts of a function over
+//! each pair (see [`super`]).
 //!
-//! In: covariances. Out: columns, resistance ratios, odd and even parts (see [`super`]), in the units of the states.
-//! If the covariance has no factor, `PartialCholesky::is_positive` is false, and results can be NaN.
+//! In: covariances. Out: columns, resistance ratios, and odd and even parts, in the units of the states. If a
+//! covariance has no Cholesky factor, `PartialCholesky::is_positive` is false, and results can be NaN.
 
 use super::types::{KernelConstants, at};
 use crate::cell::estimator::state_vector::LOG_RESISTANCE;
 use crate::filter::simd::{Lanes, Mask};
 
-/// Number of columns of the factor that change more than branch voltages.
+/// Number of columns of the Cholesky factor that change more than branch voltages.
 pub(super) const COLUMNS: usize = 3;
 
 /// The first columns of the lower Cholesky factor, and the remaining covariance of the branches.
 pub(super) struct PartialCholesky<const L: usize, const N: usize> {
     pub(super) columns: [[Lanes<L>; N]; COLUMNS],
-    /// Element `rest[i][j]` is the remaining covariance of the branch states i and j <= i. All other elements are zero.
+    /// `rest[i][j]`: remaining covariance of the branch states i and j <= i. All other elements are zero.
     pub(super) rest: [[Lanes<L>; N]; N],
     pub(super) is_positive: Mask<L>,
 }
@@ -39,18 +40,16 @@ impl<const L: usize, const N: usize> PartialCholesky<L, N> {
     }
 }
 
-/// A column of the factor.
 struct CholeskyColumn<const L: usize, const N: usize> {
-    /// The same column of the covariance, minus the contributions of the previous columns.
+    /// Column of the covariance, minus the contributions of the previous columns.
     left: [Lanes<L>; N],
     per_pivot: Lanes<L>,
-    /// `left` divided by the root of the pivot: the factor's column.
     scaled: [Lanes<L>; N],
 }
 
 impl<const L: usize, const N: usize> CholeskyColumn<L, N> {
-    /// Computes column K from the columns before it, without waiting for their square roots. If the pivot is not
-    /// positive, the column contains NaN.
+    /// Computes column K from the previous columns without their square roots, so that the processor does not wait for
+    /// a root. If the pivot is not positive, the column contains NaN.
     #[inline(always)]
     fn new<const T: usize, const K: usize>(covariance: &[Lanes<L>; T], done: [&Self; K]) -> Self {
         let mut left = [Lanes::splat(0.0); N];
@@ -92,12 +91,11 @@ fn is_positive<const L: usize, const N: usize>(rest: &[[Lanes<L>; N]; N]) -> Mas
     positive
 }
 
-/// Resistance ratios of the sigma points relative to the centre. Only the first two pairs differ from the centre.
+/// Resistance ratios of the sigma points relative to the centre. The third pair has the ratio of the centre.
 pub(super) struct ResistanceRatios<const L: usize> {
-    /// Factor of the first pair's plus and minus point.
     pub(super) first: [Lanes<L>; 2],
-    /// Odd and even part of the second pair's factor: sinh d / s and (cosh d - 1) / s. d is the distance of the pair's
-    /// points from the centre in ln(resistance).
+    /// Odd and even part of the second pair's factor: sinh d / s and (cosh d - 1) / s. d is the distance of the points
+    /// from the centre in ln(resistance).
     pub(super) second: [Lanes<L>; 2],
 }
 
@@ -114,7 +112,7 @@ impl<const L: usize> ResistanceRatios<L> {
     }
 }
 
-/// Odd and even parts of a function over the pairs of the first columns.
+/// Odd and even parts of a function, for each pair of the first three columns.
 #[derive(Clone, Copy)]
 pub(super) struct OddEvenParts<const L: usize> {
     pub(super) odd: [Lanes<L>; COLUMNS],
@@ -138,7 +136,6 @@ impl<const L: usize> OddEvenParts<L> {
     }
 }
 
-/// Sum of products over the columns.
 #[inline(always)]
 pub(super) fn sum<const L: usize>(a: [Lanes<L>; COLUMNS], b: [Lanes<L>; COLUMNS]) -> Lanes<L> {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

@@ -1,7 +1,10 @@
 //! Predicts the state over a measured time with the circuit's equations.
 //!
 //! In: a state, charge (A s) and time (s). Out: mean and covariance after this time, in the units of the states, and a
-//! mask of the lanes whose covariance was positive definite.
+//! mask of the lanes whose covariance was positive definite. Each lane is one cell.
+//!
+//! [`super`] explains the centre, the pairs, and the odd and even parts. A constant error is an error that does not
+//! change with time, such as the offset of a sensor.
 
 use super::points::{COLUMNS, OddEvenParts, PartialCholesky, ResistanceRatios, sum};
 use super::types::{FilterState, KernelConstants, StepInput, at};
@@ -11,18 +14,16 @@ use crate::cell::estimator::state_vector::{
 };
 use crate::filter::simd::{Lanes, Mask};
 
-/// Maximum duration (s) of a step in the random walk of the resistance. A longer step counts as this long, because a
-/// cell hardly ages in a gap.
+/// Maximum time of a step (s) for the random walk of the resistance. Longer steps count as this time, because a cell
+/// hardly ages in a gap.
 const MAX_WALK_S: f64 = 600.0;
 
-/// Values of a branch at L table points, for the measured time.
 struct BranchStep<const L: usize> {
-    /// Resistance of new cells (ohm).
     r_ohm: Lanes<L>,
     tau_s: Lanes<L>,
     /// Remaining fraction of the branch's voltage after the measured time.
     decay: Lanes<L>,
-    /// The exact value of `decay`, even if Euler's rule is used.
+    /// exp(-time / tau), even if `decay` follows Euler's rule.
     exact: Lanes<L>,
 }
 
@@ -37,8 +38,8 @@ impl<const L: usize> BranchStep<L> {
         Self { r_ohm, tau_s, decay, exact }
     }
 
-    /// Voltage, after the measured time, of a branch that starts at the voltage `u`. `drive` is the mean current (A)
-    /// times the resistance ratio of the cell, so the branch would settle at `r_ohm` x `drive`.
+    /// Voltage of the branch after the measured time, if it starts at the voltage `u`. `drive` is the mean current (A)
+    /// times the resistance ratio of the cell. The branch settles at `r_ohm` x `drive`.
     #[inline(always)]
     fn voltage_v(&self, drive: Lanes<L>, u: Lanes<L>) -> Lanes<L> {
         self.r_ohm * drive * (Lanes::splat(1.0) - self.decay) + u * self.decay
@@ -46,8 +47,7 @@ impl<const L: usize> BranchStep<L> {
 }
 
 /// Predicts the SOC after a discharge of `charge_ah`. Returns the decrease of the SOC at the centre, and the odd and
-/// even parts of the new SOC for each pair of sigma points. The new SOC is a nonlinear function of the state only
-/// because the charge is divided by the capacity.
+/// even parts of the new SOC. The new SOC is nonlinear only because the charge is divided by the capacity.
 #[inline(always)]
 fn soc_parts<const L: usize, const N: usize>(
     c: &KernelConstants,
@@ -67,21 +67,17 @@ fn soc_parts<const L: usize, const N: usize>(
     (charge_ah * per_capacity, parts)
 }
 
-/// Prediction of a branch.
 struct BranchPrediction<const L: usize> {
-    /// The branch's voltage at the centre.
     centre_v: Lanes<L>,
-    /// Remaining fraction of the branch's voltage, at the centre.
     decay: Lanes<L>,
-    /// Voltage that a mean current of 1 A adds to the branch of a new cell in the measured time. It is computed at the
-    /// centre, in V per A (ohm).
+    /// Voltage gained in the measured time per ampere of mean current (ohm), for a new cell.
     gain_ohm: Lanes<L>,
     noise: Lanes<L>,
     parts: OddEvenParts<L>,
 }
 
 /// Predicts branch `i`. `drive` is the mean current (A) times the resistance ratio of the cell. The first pair of sigma
-/// points has other table points and resistances than the centre; the second pair has only other resistances.
+/// points differs from the centre in table points and resistances, the second pair only in resistances.
 #[inline(always)]
 fn predict_branch<const L: usize, const N: usize, const W: usize>(
     c: &KernelConstants,
@@ -108,7 +104,7 @@ fn predict_branch<const L: usize, const N: usize, const W: usize>(
     BranchPrediction { centre_v, decay, gain_ohm, noise, parts }
 }
 
-/// Charge that one standard deviation of each constant error adds to the measured charge (A) s.
+/// Charge (A s) that one standard deviation of each constant error adds to the measured charge.
 #[inline(always)]
 fn excess_as<const L: usize>(c: &KernelConstants, input: &StepInput<L>) -> [Lanes<L>; CONSTANT_ERRORS] {
     let mut excess_as = [Lanes::splat(0.0); CONSTANT_ERRORS];
@@ -117,8 +113,8 @@ fn excess_as<const L: usize>(c: &KernelConstants, input: &StepInput<L>) -> [Lane
     excess_as
 }
 
-/// Predicts the state. The SOC gains the variance `soc_per_s` per second. The mask is true where the covariance before
-/// the prediction was positive definite.
+/// Predicts the state. The SOC gains the variance `soc_per_s` per second. The mask is true if the covariance before the
+/// prediction was positive definite.
 #[inline(always)]
 pub(in crate::cell::estimator::bank) fn predict<const L: usize, const N: usize, const T: usize, const W: usize>(
     tables: &mut Tables<W>,
@@ -168,7 +164,7 @@ pub(in crate::cell::estimator::bank) fn predict<const L: usize, const N: usize, 
         p[at(i, CAPACITY)] = sum(capacity_column, odd);
         for j in BRANCHES..=i {
             let (other, other_decay) = &done[j];
-            // All columns beyond the second are multiplied by the same factor.
+            // All columns after the second are multiplied by the decay factors of the two branches.
             let others = x.covariance[at(i, j)] - l[0][i] * l[0][j] - l[1][i] * l[1][j];
             p[at(i, j)] = odd[0] * other.odd[0]
                 + odd[1] * other.odd[1]

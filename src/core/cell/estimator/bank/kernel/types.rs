@@ -1,6 +1,7 @@
 //! State, inputs, outcome and constants of the kernel.
 //!
-//! In: the estimator's settings and the cell model. Out: values in the units of the states, lane by lane.
+//! In: the estimator's settings and the cell model. Out: values in the units of the states, one cell per lane. Constant
+//! errors do not change with time, for example the offset of a sensor.
 
 use std::array::from_fn;
 
@@ -11,50 +12,35 @@ use crate::cell::estimator::state_vector::{BRANCHES, CONSTANT_ERRORS, square};
 use crate::cell::{CellModel, Discretisation, EstimatorConfig, SensorErrors};
 use crate::filter::simd::{Lanes, Mask};
 
-/// Filter states of L cells: N means, the T elements of the covariance's lower triangle, the effects of the constant
-/// errors, and a memory.
+/// Filter states of L cells: N means, and the T elements of the covariance's lower triangle.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(in crate::cell::estimator::bank) struct FilterState<const L: usize, const N: usize, const T: usize> {
-    /// Means in the order of the estimator's state.
     pub(in crate::cell::estimator::bank) mean: [Lanes<L>; N],
     /// Covariance without the constant errors, row by row to the diagonal.
     pub(in crate::cell::estimator::bank) covariance: [Lanes<L>; T],
     /// Errors of the means caused by one standard deviation of each constant error.
     pub(in crate::cell::estimator::bank) by_constant: [[Lanes<L>; N]; CONSTANT_ERRORS],
-    /// Part of the estimator's `Memory`, see [`LOAD_A`] to [`SLOW_STD`].
+    /// Values of the estimator's `Memory`, at the indices [`LOAD_A`] to [`SLOW_STD`].
     pub(in crate::cell::estimator::bank) memory: [Lanes<L>; MEMORY],
 }
 
-/// The memory of one cell.
 pub(in crate::cell::estimator::bank) type HotMemory = [Lanes<1>; MEMORY];
 
-/// Number of memory values that steps change or read.
 pub(in crate::cell::estimator::bank) const MEMORY: usize = 12;
-/// Low-pass of |current|, A.
+// Indices in the memory. Steps read CURVE_AH, CURVE_STD_AH, SLOW_RATIO and SLOW_STD, but do not change them.
+/// Low-pass of |current| (A).
 pub(in crate::cell::estimator::bank) const LOAD_A: usize = 0;
-/// Mean normalised innovation squared.
 pub(in crate::cell::estimator::bank) const MEAN_NIS: usize = 1;
-/// Time that the next reading represents (s).
 pub(in crate::cell::estimator::bank) const INFORMATION_S: usize = 2;
-/// Time at rest (s).
 pub(in crate::cell::estimator::bank) const REST_S: usize = 3;
-/// Information about the current's offset.
 pub(in crate::cell::estimator::bank) const OFFSET_INFORMATION: usize = 4;
-/// Evidence about the current's offset.
 pub(in crate::cell::estimator::bank) const OFFSET_SCORE: usize = 5;
-/// Capacity of the open-circuit curve (Ah). Steps do not change it.
 pub(in crate::cell::estimator::bank) const CURVE_AH: usize = 6;
-/// Standard deviation of the curve's capacity (Ah). Steps do not change it.
 pub(in crate::cell::estimator::bank) const CURVE_STD_AH: usize = 7;
 
-/// Information about the ratio of the slowest branch.
 pub(in crate::cell::estimator::bank) const SLOW_INFORMATION: usize = 8;
-/// Evidence about the ratio of the slowest branch.
 pub(in crate::cell::estimator::bank) const SLOW_SCORE: usize = 9;
-/// Ratio of the slowest branch's resistance to the model's, in addition to the resistance ratio of the cell. Steps do
-/// not change it.
 pub(in crate::cell::estimator::bank) const SLOW_RATIO: usize = 10;
-/// Standard deviation of the ratio of the slowest branch. Steps do not change it.
 pub(in crate::cell::estimator::bank) const SLOW_STD: usize = 11;
 
 /// Index of the covariance of `i` and `j` <= `i`.
@@ -62,7 +48,6 @@ pub(in crate::cell::estimator::bank) const fn at(i: usize, j: usize) -> usize {
     i * (i + 1) / 2 + j
 }
 
-/// Inputs for one step of L cells.
 #[derive(Debug, Clone, Copy)]
 pub(in crate::cell::estimator::bank) struct StepInput<const L: usize> {
     pub(in crate::cell::estimator::bank) measured_s: Lanes<L>,
@@ -71,23 +56,20 @@ pub(in crate::cell::estimator::bank) struct StepInput<const L: usize> {
     pub(in crate::cell::estimator::bank) current_a: Lanes<L>,
     pub(in crate::cell::estimator::bank) voltage_v: Lanes<L>,
     pub(in crate::cell::estimator::bank) temperature_c: Lanes<L>,
-    /// Decay of the memories over the measured time.
     pub(in crate::cell::estimator::bank) decay: DecayFactors<L>,
 }
 
-/// Decay factors over the time of a step.
 #[derive(Debug, Clone, Copy)]
 pub(in crate::cell::estimator::bank) struct DecayFactors<const L: usize> {
     /// Decay of the load's low-pass.
     pub(super) load: Lanes<L>,
     /// Decay of the consistency monitor.
     pub(super) consistency: Lanes<L>,
-    /// 1 / time, 1/s; 0 if no time passed.
+    /// 1 / time (1/s); 0 if no time has passed.
     pub(super) per_s: Lanes<L>,
 }
 
 impl<const L: usize> DecayFactors<L> {
-    /// No decay.
     pub(in crate::cell::estimator::bank) const NONE: Self =
         Self { load: Lanes([1.0; L]), consistency: Lanes([1.0; L]), per_s: Lanes([0.0; L]) };
 
@@ -100,7 +82,6 @@ impl<const L: usize> DecayFactors<L> {
         }
     }
 
-    /// The same factors in every lane.
     pub(in crate::cell::estimator::bank) fn splat(one: &DecayFactors<1>) -> Self {
         let splat = |x: &Lanes<1>| Lanes::splat(x.0[0]);
         Self { load: splat(&one.load), consistency: splat(&one.consistency), per_s: splat(&one.per_s) }
@@ -112,13 +93,11 @@ impl<const L: usize> DecayFactors<L> {
     }
 }
 
-/// Outcome of a step.
 #[derive(Debug, Clone, Copy)]
 pub(in crate::cell::estimator::bank) struct StepOutcome<const L: usize> {
     /// After an update: whether the covariance was positive definite and the variance of the innovation is positive.
     /// After a whole step: also whether the reading is within the gate and the new state is possible.
     pub(in crate::cell::estimator::bank) is_usable: Mask<L>,
-    /// Whether the innovation is within the gate.
     pub(in crate::cell::estimator::bank) is_accepted: Mask<L>,
     pub(in crate::cell::estimator::bank) innovation_v: Lanes<L>,
     pub(in crate::cell::estimator::bank) innovation_variance: Lanes<L>,
@@ -128,9 +107,9 @@ pub(in crate::cell::estimator::bank) struct StepOutcome<const L: usize> {
 /// Settings in the form that the kernel uses.
 #[derive(Debug, Clone, PartialEq)]
 pub(in crate::cell::estimator::bank) struct KernelConstants {
-    /// Spread s of the sigma points.
+    /// Factor s of the sigma points x +- s L_k (see [`super`]).
     pub(super) scale: f64,
-    /// Factor of m m' in the covariance: beta - alpha^2.
+    /// Factor of m m' in the covariance (see [`super`]): beta - alpha^2.
     pub(super) excess: f64,
     pub(super) euler: bool,
     pub(in crate::cell::estimator::bank) process: ProcessVariances,
@@ -155,21 +134,20 @@ pub(in crate::cell::estimator::bank) struct ProcessVariances {
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct ReadingVariances {
     pub(super) sensor: f64,
-    /// Variance of the model's error over one second; used if the tables state no error.
+    /// If the tables state no error: variance of the model's error over one second.
     pub(super) model: f64,
-    /// Variance of the model's error per square of the voltage drop, over one second.
+    /// Variance of the model's error over one second, per square of the voltage drop.
     pub(super) drop: f64,
-    /// Variance of the model's error per square of the load's voltage, over one second.
+    /// Variance of the model's error over one second, per square of the load's voltage drop.
     pub(super) load: f64,
     pub(super) gate: f64,
-    /// Variance that the gate adds per square of the open-circuit voltage's slope.
+    /// Variance that the gate adds, per square of the open-circuit voltage's slope.
     pub(super) gate_soc: f64,
     /// Maximum test ratio of an accepted reading.
     pub(super) gate_limit: f64,
 }
 
 impl KernelConstants {
-    /// Time that a reading represents (s).
     #[inline(always)]
     pub(in crate::cell::estimator::bank) fn information_s<const L: usize>(
         &self,
@@ -209,7 +187,6 @@ impl KernelConstants {
 }
 
 impl<const N: usize, const T: usize> FilterState<1, N, T> {
-    /// The state of one cell, with the numbers of its memory.
     pub(in crate::cell::estimator::bank) fn new(x: &Gaussian, memory: [Lanes<1>; MEMORY]) -> Self {
         let mut covariance = [Lanes([0.0]); T];
         for i in 0..N {
@@ -225,7 +202,6 @@ impl<const N: usize, const T: usize> FilterState<1, N, T> {
         }
     }
 
-    /// Returns the state as a [`Gaussian`].
     pub(in crate::cell::estimator::bank) fn gaussian(&self) -> Gaussian {
         let (mut mean, mut covariance, mut by_constant) = (SVector::zeros(), SMatrix::zeros(), SMatrix::zeros());
         for i in 0..N {
@@ -240,7 +216,6 @@ impl<const N: usize, const T: usize> FilterState<1, N, T> {
         Gaussian { states: N, mean, covariance, by_constant }
     }
 
-    /// Copies the states of one lane.
     pub(in crate::cell::estimator::bank) fn of_lane<const L: usize>(all: &FilterState<L, N, T>, lane: usize) -> Self {
         let take = |x: &Lanes<L>| Lanes([x.0[lane]]);
         Self {
@@ -253,7 +228,6 @@ impl<const N: usize, const T: usize> FilterState<1, N, T> {
 }
 
 impl<const L: usize, const N: usize, const T: usize> FilterState<L, N, T> {
-    /// Puts the state of one cell into a lane.
     pub(in crate::cell::estimator::bank) fn set_lane(&mut self, lane: usize, one: &FilterState<1, N, T>) {
         for i in 0..N {
             self.mean[i].0[lane] = one.mean[i].0[0];
@@ -269,7 +243,7 @@ impl<const L: usize, const N: usize, const T: usize> FilterState<L, N, T> {
         }
     }
 
-    /// Replaces the state by the new state where the mask is true.
+    /// Where the mask is true, replaces the state by `new`.
     #[inline(always)]
     pub(in crate::cell::estimator::bank) fn take_where(&mut self, mask: Mask<L>, new: &Self) {
         for i in 0..N {

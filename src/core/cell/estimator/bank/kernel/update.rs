@@ -1,8 +1,11 @@
 //! Updates the state with a measured voltage.
 //!
-//! In: a state and the reading (V). Out: the updated state, the innovation (V), the variance of the innovation (V^2),
-//! and the test ratio. The test ratio is the squared innovation divided by the variance that the gate assumes. One mask
-//! marks the usable lanes, another one the lanes within the gate.
+//! In: a state and the reading (V). Out: the updated state, the innovation (V), its variance (V^2), and the test ratio.
+//! The test ratio is the squared innovation divided by the variance that the gate assumes. One mask marks the usable
+//! lanes (cells), and another mask marks the lanes within the gate.
+//!
+//! [`super`] explains the centre, the pairs, and the odd and even parts. A constant error is an error that does not
+//! change with time, such as the offset of a sensor.
 
 use super::points::{COLUMNS, OddEvenParts, PartialCholesky, ResistanceRatios};
 use super::types::{
@@ -18,20 +21,16 @@ use crate::cell::estimator::state_vector::{
 use crate::cell::model::ERROR_WINDOW_S;
 use crate::filter::simd::Lanes;
 
-/// Predicted voltage.
 struct PredictedVoltage<const L: usize> {
-    /// Voltage at the centre sigma point (V).
+    /// At the centre sigma point (V).
     centre_v: Lanes<L>,
-    /// Odd and even parts of the voltage, for each of the first [`COLUMNS`] pairs of sigma points.
+    /// For each of the first [`COLUMNS`] pairs of sigma points.
     parts: OddEvenParts<L>,
-    /// Slope of the open-circuit voltage (V per unit of SOC).
     slope_v: Lanes<L>,
-    /// Changes of the open-circuit voltage. First the change per Ah of capacity (V per Ah), then, for each mix of
-    /// losses (see `crate::cell::aged_ocv`), the change per standard deviation of the mix (V).
+    /// Changes of the open-circuit voltage: first per Ah of capacity (V per Ah), then per standard deviation of each
+    /// mix of losses (V, see `crate::cell::aged_ocv`).
     changes_v: [Lanes<L>; 1 + MIXES],
-    /// Present voltage drop in the cell (V).
     lost_v: Lanes<L>,
-    /// Series resistance (ohm).
     r0_ohm: Lanes<L>,
     /// Variance of the model's error over one second (V^2).
     base_variance: Lanes<L>,
@@ -87,8 +86,8 @@ impl<const L: usize> PredictedVoltage<L> {
     }
 }
 
-/// Contribution of a part of branch `i`'s voltage to the cell's voltage. If the branch is the slowest, the part is
-/// multiplied by the learned ratio of the slowest branch.
+/// Contribution of `part_v`, a part of branch `i`'s voltage, to the cell's voltage. The slowest branch is multiplied by
+/// its learned ratio.
 #[inline(always)]
 fn weighed<const L: usize, const N: usize, const T: usize>(
     x: &FilterState<L, N, T>,
@@ -140,7 +139,6 @@ pub(in crate::cell::estimator::bank) fn update<const L: usize, const N: usize, c
     let OddEvenParts { odd, even } = predicted.parts;
     let shift_v = predicted.parts.shift(c);
 
-    // Covariance of state and voltage, and the voltage's variance.
     let mut cross = [Lanes::splat(0.0); N];
     let mut variance = shift_v.square() * c.excess;
     for k in 0..COLUMNS {
@@ -160,13 +158,12 @@ pub(in crate::cell::estimator::bank) fn update<const L: usize, const N: usize, c
         variance = variance + weighed(x, i, others);
     }
 
-    // Measurement noise. The documentation of `estimator` explains its formula under "Deviation 4".
+    // Measurement noise, see "Deviation 4" in `estimator`.
     let load_v = predicted.settled_ohm * ratio * x.memory[LOAD_A];
     let model = predicted.base_variance + predicted.lost_v.square() * c.reading.drop + load_v.square() * c.reading.load;
     let own_variance = variance + (model / information_s + c.reading.sensor);
     let innovation_v = input.voltage_v - (predicted.centre_v + shift_v);
 
-    // The constant errors.
     let by_constant = by_constant(c, x, input, &predicted);
     let mut constant_variance = Lanes::splat(0.0);
     for k in 0..CONSIDERED {

@@ -11,11 +11,12 @@ use crate::cell::estimator::state_vector::{
 use crate::cell::{CellModel, ERROR_WINDOW_S, EstimatorConfig, GridPosition, SensorErrors, TemperaturePosition};
 use crate::filter::ScalarGaussian;
 
-/// Maximum duration (s) of a step in the random walk of the resistance. A longer step counts as this long, because a
-/// cell hardly ages in a gap.
+/// Maximum time of a step (s) for the random walk of the resistance. Longer steps count as this time, because a cell
+/// hardly ages in a gap.
 const MAX_WALK_S: f64 = 600.0;
 
-/// Covariance that the random walks gain in `dt_s`. The noise of the capacity is added at the end of half-cycles.
+/// Covariance that the random walks gain in `dt_s`. The noise of the capacity is added elsewhere, after each charge or
+/// discharge.
 pub(super) fn process<const N: usize>(
     model: &CellModel,
     config: &EstimatorConfig,
@@ -24,7 +25,8 @@ pub(super) fn process<const N: usize>(
 ) -> SMatrix<f64, N, N> {
     let mut q = SMatrix::zeros();
     for i in BRANCHES..N {
-        // A branch decays, so it loses old noise: a step of any length counts as at most tau/2.
+        // The noise in a branch decays with the branch's voltage. A step of any length therefore counts as at most
+        // tau/2.
         let half_tau_s = 0.5 * model.branch_tau_s(i - BRANCHES, position);
         let effective_s = half_tau_s * -libm::expm1(-dt_s / half_tau_s);
         q[(i, i)] = square(config.process.branch_v_per_sqrt_s) * effective_s;
@@ -33,30 +35,26 @@ pub(super) fn process<const N: usize>(
     q
 }
 
-/// A voltage reading with the inputs of its prediction.
 pub(super) struct VoltageReading {
     pub(super) voltage_v: f64,
     pub(super) current_a: f64,
     pub(super) load_a: f64,
     pub(super) temperature: TemperaturePosition,
     pub(super) information_s: f64,
-    /// Capacity (Ah) that selects the open-circuit curve of the aged cell, as learned up to the end of the last
-    /// half-cycle. A voltage must not change the capacity through the shape of the curve, because errors of the model
-    /// would be mistaken for lost capacity.
+    /// Capacity (Ah) that selects the open-circuit curve of the aged cell, as learned up to the end of the last charge
+    /// or discharge. If a voltage changed this capacity at once, errors of the model would be mistaken for lost
+    /// capacity.
     pub(super) curve: ScalarGaussian,
-    /// Resistance of the slowest branch relative to the model, in addition to the resistance ratio of the cell.
+    /// Resistance ratio of the slowest branch, in addition to the resistance ratio of the cell.
     pub(super) slow_ratio: f64,
-    /// Standard deviation of `slow_ratio`.
     pub(super) slow_std: f64,
 }
 
 impl VoltageReading {
-    /// Voltage over the branches of a state (V).
     pub(super) fn branches_v<const N: usize>(&self, x: &SVector<f64, N>) -> f64 {
         (BRANCHES..N - 1).fold(self.slow_ratio * x[N - 1], |sum, i| sum + x[i])
     }
 
-    /// Measurement noise of this reading for a cell at state `x`.
     pub(super) fn noise<const N: usize>(
         &self,
         x: &Gaussian<N>,
@@ -86,7 +84,7 @@ impl VoltageReading {
         }
     }
 
-    /// Effect of each constant error on the innovation (V) per standard deviation of the error.
+    /// Effect of one standard deviation of each constant error (such as a sensor offset) on the innovation (V).
     fn by_constant<const N: usize>(
         &self,
         x: &Gaussian<N>,

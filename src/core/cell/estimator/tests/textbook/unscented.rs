@@ -1,20 +1,14 @@
 //! Unscented Kalman filter with additive noise and a scalar measurement.
 //!
-//! The state x has N numbers and the covariance P. The sigma points are x and x +/- sqrt(N + lambda) L_i. L_i is column
-//! i of the lower Cholesky factor of P, and lambda = alpha^2 (N + kappa) - N. The weights follow Wan and van der Merwe
-//! (2000), equations 15. A prediction passes every point through f and takes the mean and covariance of the images,
-//! plus Q. An update **redraws** the points from the predicted mean and covariance and passes them through h. (Some
-//! packages reuse the propagated points; this changes the SOC by up to 3e-4 on drive data.)
+//! Sigma points, weights and the columns of the constant errors are described in [`crate::cell::estimator`]. A
+//! prediction passes every point through f and takes the mean and covariance of the images, plus Q. An update
+//! **redraws** the points from the predicted mean and covariance and passes them through h. Some packages reuse the
+//! propagated points instead, which changes the SOC by up to 3e-4 on drive data.
 //!
-//! Constant errors of measurements and model (offsets, gains) are not estimated here. Each constant error has a column:
-//! the error of every state that one standard deviation of this constant error has caused. The total covariance is P
-//! plus the outer products of the columns. The gain considers the first [`CONSIDERED`] constant errors (Schmidt 1966):
-//! an update weighs the measurement by its covariance with these errors, so they never average out. The gain is then
-//! not optimal for P alone, so P is updated in Joseph's form. The remaining constant errors do not change the mean;
-//! their columns show their effect (Friedland 1969).
+//! Constant errors are not estimated here. The total covariance is P plus the outer products of their columns.
 //!
-//! The resulting covariance is symmetric. A failed factorisation or a non-finite number is an error; nothing is
-//! repaired silently. Sums are plain loops in a fixed order, so every machine gives the same bits.
+//! A failed factorisation or a non-finite number is an error. Sums are plain loops in a fixed order, so every machine
+//! gives the same bits.
 
 use nalgebra::{SMatrix, SVector};
 
@@ -25,7 +19,6 @@ use crate::filter::ScalarGaussian;
 /// Mean and covariance of N numbers.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Gaussian<const N: usize> {
-    /// Mean.
     pub(super) mean: SVector<f64, N>,
     /// Covariance without the constant errors, symmetric and positive definite.
     pub(super) covariance: SMatrix<f64, N, N>,
@@ -36,13 +29,10 @@ pub(super) struct Gaussian<const N: usize> {
 /// Reason why a step failed; the state is unchanged.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum FilterError {
-    /// The covariance has no Cholesky factor.
     NotPositiveDefinite,
-    /// The result contains a NaN or an infinity.
     NotFinite,
 }
 
-/// Scale and weights of the sigma points for N states.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct SigmaPointWeights {
     scale: f64,
@@ -52,8 +42,7 @@ pub(super) struct SigmaPointWeights {
 }
 
 impl SigmaPointWeights {
-    /// Computes the weights for `n` states from alpha (above 0, at most 1), beta and kappa; `n` + `kappa` must be
-    /// positive.
+    /// `n`: number of states. alpha is above 0 and at most 1. `n` + `kappa` must be positive.
     pub(super) fn new(n: usize, alpha: f64, beta: f64, kappa: f64) -> Self {
         let total = alpha * alpha * (n as f64 + kappa); // n + lambda
         let mean_0 = (total - n as f64) / total;
@@ -61,18 +50,16 @@ impl SigmaPointWeights {
     }
 }
 
-/// Variances of one scalar measurement.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct MeasurementNoise {
-    /// Variance that determines the weight of the measurement.
+    /// Determines the weight of the measurement.
     pub(super) variance: f64,
-    /// Variance of the error of a single reading, for the gate. It differs from `variance` if `variance` depends on the
-    /// time that the reading represents.
+    /// Variance of the error of a single reading, for the gate. `variance` can also depend on the time that the reading
+    /// represents.
     pub(super) gate_variance: f64,
-    /// Gate width in standard deviations.
     pub(super) gate_sigma: f64,
-    /// Change of (measurement minus prediction) per standard deviation of each constant error. It has two parts: the
-    /// direct effect, and the effect through the errors of the mean that the constant error has caused.
+    /// Change of the innovation per standard deviation of each constant error. It contains the direct effect, and the
+    /// effect through the errors of the mean that the constant error has caused.
     pub(super) by_constant: SVector<f64, CONSTANT_ERRORS>,
 }
 
@@ -99,9 +86,8 @@ impl<const N: usize> Gaussian<N> {
         })
     }
 
-    /// Propagates the state through `f` and adds the process noise covariance `q`.
-    ///
-    /// Returns an error if the covariance cannot be factored or the result is not finite. The state is then unchanged.
+    /// Propagates the state through `f` and adds the process noise covariance `q`. If the covariance cannot be factored
+    /// or the result is not finite, returns an error and leaves the state unchanged.
     pub(super) fn predict(
         &mut self,
         spread: &SigmaPointWeights,
@@ -124,10 +110,8 @@ impl<const N: usize> Gaussian<N> {
         self.set(mean, p)
     }
 
-    /// Updates the state with the scalar measurement `z` = `h`(x) + `noise`. An innovation beyond the gate is reported
-    /// and leaves the state unchanged.
-    ///
-    /// Returns an error if the covariance cannot be factored or the result is not finite. The state is then unchanged.
+    /// Updates the state with the scalar measurement `z` = `h`(x) + `noise`. An innovation beyond the gate is reported,
+    /// but does not change the state. Errors are the same as for [`Self::predict`].
     pub(super) fn update(
         &mut self,
         spread: &SigmaPointWeights,
@@ -220,7 +204,6 @@ mod tests {
         Gaussian { mean, covariance, by_constant: SMatrix::zeros() }
     }
 
-    /// Effect of the first constant error alone.
     fn first(effect: f64) -> SVector<f64, CONSTANT_ERRORS> {
         SVector::from_fn(|k, _| if k == 0 { effect } else { 0.0 })
     }
@@ -251,8 +234,8 @@ mod tests {
 
     #[test]
     fn considered_errors_match_augmented_filter() {
-        // Compares two filters. One has the states [x0, x1, b], where b is constant and never corrected; the other has
-        // two states and a column for b.
+        // Compares two filters. One filter has the states [x0, x1, b], where b is constant and never corrected. The
+        // other filter has two states and a column for b.
         let spread = SigmaPointWeights::new(2, 1.0, 2.0, 0.0);
         let (f, h, hb, r) = (matrix![1.0, 0.1; 0.0, 0.9], matrix![1.0, 0.4], 0.3, 0.02);
         let into = vector![0.05, 0.0];
@@ -323,12 +306,13 @@ mod tests {
 
     #[test]
     fn matched_noise_gives_consistent_innovations() {
-        // A small generator with a fixed seed draws a random walk and the noise of its measurements. The mean NIS must
-        // be 1 within 3 sigma.
+        // A generator with a fixed seed draws a random walk and noisy measurements of it. The mean NIS (normalised
+        // innovation squared) must be 1 within 3 sigma.
         let spread = SigmaPointWeights::new(1, 1.0, 2.0, 0.0);
         let mut seed = 0x2545_F491_4F6C_DD1D_u64;
         let mut normal = || {
-            // Sum of 12 uniforms minus 6: variance 1, near enough to Gaussian for a variance test.
+            // The sum of 12 uniform numbers minus 6 has the variance 1. It is near enough to Gaussian for a variance
+            // test.
             (0..12).fold(-6.0, |sum, _| {
                 seed ^= seed << 13;
                 seed ^= seed >> 7;

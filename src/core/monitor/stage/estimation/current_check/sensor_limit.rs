@@ -1,10 +1,11 @@
-//! Finds the limit of a current sensor: a noisy sensor repeats its readings only there.
+//! Finds the limit of a current sensor. A noisy sensor repeats its readings exactly only at its limit.
 //!
 //! In: readings of the current (A), and whether the load is steady. Out: evidence against the sensor.
 //!
-//! If the last digits of a sensor usually change under a steady load, but now stay the same, the sensor is at its limit.
-//! A coarse sensor repeats its readings, or changes them by one step. A sensor that has repeated readings of two sizes
-//! has no noise: a charger or a cycler holds the current. Such a sensor is not judged by its repeats.
+//! If the last digits of a sensor usually change under a steady load, a run of equal readings shows that the sensor is
+//! at its limit. Two kinds of sensors repeat their readings for other reasons, so their repeats are not evidence. A
+//! coarse sensor repeats its readings, or changes them by one step. A sensor without noise repeats its readings while a
+//! charger or a cycler holds the current. Such a sensor is recognised by repeated readings of two sizes.
 
 use serde::{Deserialize, Serialize};
 
@@ -17,14 +18,14 @@ const NOISE_GAIN: f64 = 0.02;
 const MIN_REPEAT: f64 = 0.01;
 /// Probability that a sensor at its limit repeats a reading.
 const FAULTY_REPEAT: f64 = 0.5;
-/// Changes of a reading above this multiple of the sensor's resolution are noise. A coarse sensor also changes by one
-/// step.
+/// Changes of a reading above this multiple of the sensor's resolution are noise. A coarse sensor without noise changes
+/// by one step.
 const NOISE_STEPS: f64 = 1.5;
-/// Resolution of the current before a change has been seen (A).
+/// Assumed resolution of the current before the first change (A).
 const MAX_RESOLUTION_A: f64 = 1e3;
-/// Number of equal readings in a row that a noisy sensor only has at its limit.
+/// A noisy sensor has this number of equal readings in a row only at its limit.
 const QUIET_READINGS: u32 = 20;
-/// Limit of `repeated` (ln of the odds for a good sensor). At this limit, the sensor becomes doubtful.
+/// If `repeated` (ln of the odds for a good sensor) falls to this value, the sensor is at its limit.
 const REPEATED: f64 = -10.0;
 
 /// Repeated readings of a sensor, and its limits; part of the stored state.
@@ -39,8 +40,8 @@ pub(super) struct SensorLimit {
     repeated: f64,
     /// Number of times that the present reading has repeated.
     equal: u32,
-    /// Size of a current that the sensor has read [`QUIET_READINGS`] times in a row before it has shown noise (A); 0 =
-    /// none.
+    /// Size of a current (A) that the sensor has read [`QUIET_READINGS`] times in a row before it has shown noise; 0 =
+    /// no such current.
     quiet_a: f64,
     /// Whether the sensor has repeated two currents of different size.
     is_quiet: bool,
@@ -83,13 +84,13 @@ impl SensorLimit {
             return 0.0;
         }
         let mut evidence = if self.limits_a.contains(&now_a) { DOUBTFUL } else { 0.0 };
-        // A limit is the largest reading of its direction.
+        // A limit is the largest reading in its direction.
         let is_largest = now_a.abs() >= self.largest_a[direction];
         if change_a > 0.0 || !is_largest || self.is_quiet {
             self.repeated = 0.0;
         } else {
             self.repeated += libm::log((1.0 - self.noisy).max(MIN_REPEAT) / FAULTY_REPEAT).min(0.0);
-            // The run may still show that the sensor is quiet.
+            // The present run may still show that the sensor has no noise.
             let is_open = self.quiet_a > 0.0 && self.equal < QUIET_READINGS;
             if self.repeated <= REPEATED && !is_open {
                 self.repeated = 0.0;
@@ -111,7 +112,7 @@ impl SensorLimit {
             return;
         }
         if self.quiet_a > 0.0 {
-            // The limits of both directions differ by one step at most.
+            // The limits of a sensor in the two directions differ by at most one step.
             self.is_quiet |= (size_a - self.quiet_a).abs() > NOISE_STEPS * self.resolution_a;
         } else if 1.0 - self.noisy >= FAULTY_REPEAT {
             self.quiet_a = size_a;
@@ -128,7 +129,6 @@ impl SensorLimit {
         self.largest_a.iter().all(|&a| a > rest_a)
     }
 
-    /// Checks a stored state; the error is the first impossible number.
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         bounds::CURRENT_A
             .check_all("a current of the sensor's limit", self.limits_a.into_iter().chain(self.largest_a))?;

@@ -3,7 +3,7 @@
 use super::*;
 use crate::quantity::CellIndex;
 
-/// Name of a fault, and the reading for a load and a time.
+/// Name of a fault, and the faulty reading (A) for a load (A) and a time (s).
 type Fault = (&'static str, fn(f64, u32) -> f64);
 
 const OHM: f64 = 2e-3;
@@ -36,12 +36,10 @@ fn samples(time_s: u32, current_a: Option<f64>, voltage_v: impl Fn(usize) -> f64
         .collect()
 }
 
-/// Handles these samples at once.
 fn handle(check: &mut CurrentCheck, samples: &[CellSample]) {
     check.handle(samples.iter().map(|sample| (sample.cell.index(), sample)), 0.001, OHM, 1.0);
 }
 
-/// Handles a round of all cells at once.
 fn round(check: &mut CurrentCheck, time_s: u32, current_a: Option<f64>, voltage_v: impl Fn(usize) -> f64) {
     handle(check, &samples(time_s, current_a, voltage_v));
 }
@@ -188,8 +186,8 @@ fn round_that_takes_seconds_is_not_compared() {
     assert_eq!((check.is_doubtful(), check.path_v()), (false, 0.0));
 }
 
-/// Runs 1800 rounds of a cycle of `cycle_ms`, in which each cell reports `apart_ms` after the previous one. `is_lost`
-/// tells whether a sample is lost: by round and cell. Returns the share of rounds in doubt.
+/// Runs 1800 rounds of a cycle of `cycle_ms`, in which each cell reports `apart_ms` after the previous cell. `is_lost`:
+/// whether the sample of a round and a cell is lost. Returns the share of rounds in doubt.
 fn spread_drive((cycle_ms, apart_ms): (u32, u32), sign: f64, factor: f64, is_lost: impl Fn(u32, u32) -> bool) -> f64 {
     let (mut check, mut doubtful) = (CurrentCheck::default(), 0);
     for round in 0..1800 {

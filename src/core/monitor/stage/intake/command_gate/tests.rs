@@ -26,12 +26,11 @@ impl Bench {
         Self { gate, now, next }
     }
 
-    /// Advances the time without an announcement.
     fn wait(&mut self, nanos: i64) {
         self.now = self.now.plus_nanos(nanos);
     }
 
-    /// Advances the time, and announces a freshness at its end.
+    /// Advances the time, and then announces a freshness.
     fn pass(&mut self, nanos: i64) {
         self.wait(nanos);
         self.next = self.gate.announce(self.now);
@@ -56,7 +55,6 @@ impl Bench {
         }
     }
 
-    /// Starts an attack at the present time.
     fn under_attack() -> Self {
         let mut bench = Self::new();
         bench.forge(10);
@@ -143,14 +141,14 @@ fn forged_frame_after_attack_starts_next_attack() {
 
 #[test]
 fn quiet_period_tolerates_one_more_forged_frame() {
-    // Two periods: the attack, and one without a wrong authenticator.
+    // Two periods pass: the attack, and a period without a wrong authenticator.
     let mut bench = Bench::under_attack();
     bench.pass(20 * SECOND_NS);
     bench.forge(1);
     assert_eq!(bench.send(RESET), Ok(()));
     bench.forge(1);
     assert_eq!(bench.send(RESET), Err(CommandRefusal::RepeatNeeded));
-    // A long pause restores the whole tolerance and not more.
+    // A long pause restores the whole tolerance, but not more.
     bench.pass(24 * 3600 * SECOND_NS);
     bench.forge(9);
     assert_eq!(bench.send(RESET), Ok(()));

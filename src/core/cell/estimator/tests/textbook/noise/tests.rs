@@ -1,4 +1,4 @@
-//! Compares the noise with closed formulas.
+//! Compares the process and measurement noise with closed formulas.
 
 use super::*;
 use crate::cell::Table;
@@ -40,12 +40,12 @@ fn reading_variance_sums_its_parts() {
         .noise(&x, model, &config)
     };
     let at = |load_a: f64, current_a: f64, information_s: f64| of(&model, load_a, current_a, information_s);
-    // At 0 degrees C and a SOC of 0.5, the series resistance is 60 mohm and the branch has 20 mohm.
+    // At 0 degrees C and SOC 0.5, the series resistance is 60 mohm, and the branch has 20 mohm.
     let (base, drop, load) = (0.15 * 0.15, square(0.3 * (0.06 * 2.0 + 0.05)), square(0.5 * 0.08 * 5.0));
     assert!(near(at(5.0, 2.0, 10.0).variance, (base + drop + load) / 10.0));
     assert!(near(at(0.0, 2.0, 1.0).variance, base + drop));
     assert_eq!(at(5.0, 2.0, 10.0).gate_variance, at(0.0, 0.0, 1.0).gate_variance);
-    // The model's own error is an average over 100 s: 20 mV over 100 s correspond to 0.2 V over one second.
+    // The model states its error as an average over 100 s: 20 mV over 100 s correspond to 0.2 V over one second.
     model.voltage_error_v = Some(Table { values: vec![vec![0.01, 0.02, 0.03]; 2] });
     let variance = of(&model, 0.0, 2.0, 1.0).variance;
     assert!(near(variance, 0.2 * 0.2 + drop), "{variance} {}", 0.2 * 0.2 + drop);
