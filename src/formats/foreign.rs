@@ -6,8 +6,9 @@ const TAR_MAGIC_AT: usize = 257;
 /// Advice for text logs that few tools write.
 const VIA_SAVVYCAN: &str = "open it in SavvyCAN and save it as GVRET CSV";
 
-/// Finds the format of a file that packwatch cannot read from its first bytes (at least 512). Returns the name of the
-/// format and a sentence about its conversion: "SQLite database", "export a CSV with sqlite3 -csv". `None` = unknown.
+/// Takes the first bytes (at least 512) of a file that packwatch cannot read, and finds the format of the file. Returns
+/// the name of the format and a sentence about its conversion: "SQLite database", "export a CSV with sqlite3 -csv".
+/// `None` = unknown.
 pub fn foreign(head: &[u8]) -> Option<(&'static str, &'static str)> {
     let begins = |magics: &[&[u8]]| magics.iter().any(|magic| head.starts_with(magic));
     let contains = |text: &[u8]| memchr::memmem::find(&head[..head.len().min(4096)], text).is_some();

@@ -26,9 +26,9 @@ use crate::{Channel, Format, Item, LogReader, Position};
 use cursor::{Cursor, Fault};
 use lines::{Line, Lines};
 
-/// Maximum number of channels in a log, because an index has 8 bits. Maximum length of a channel's name, bytes; the
-/// name of a Linux interface has at most 15.
+/// Maximum number of channels in a log. The index of a channel has 8 bits.
 const MAX_CHANNELS: usize = 256;
+/// Maximum length of a channel's name, bytes. The name of a Linux interface has at most 15.
 const MAX_NAME: usize = 64;
 
 /// Parses the lines of a format.
@@ -193,7 +193,7 @@ impl Channels {
     }
 }
 
-/// The expected content, for the fault about a channel that [`Channels`] refuses.
+/// Text after "expected" in the fault of a line whose channel [`Channels`] rejects.
 const CHANNEL: &str = "a channel (at most 256 channels)";
 
 /// A sum of times; `None` beyond the range of [`Timestamp`].

@@ -50,7 +50,7 @@ impl Calibration {
         let mean = ratios.iter().sum::<f64>() / ratios.len() as f64;
         let inputs: Vec<f64> = rows.iter().flat_map(|row| data.row(*row as usize).to_vec()).collect();
         let tree =
-            // With fewer than 20 rows, the spread is 1 everywhere.
+            // If `near` is below 20 (fewer than 400 selected rows), the spread is 1 everywhere.
             (near >= 20 && mean > 0.0).then(|| KdTree::new(&inputs, &inverse_deviations(&inputs, data)));
         let mut calibration = Self { factor: GAUSSIAN, rows, ratios, near, mean, tree };
         let d = data.dimensions;

@@ -61,8 +61,8 @@ async fn serve(settings: &Settings) -> std::io::Result<()> {
     let (mut pause, mut latest_error) = (FIRST_PAUSE, String::new());
     loop {
         let connections = journal.counts.connections;
-        // The first batch of a connection has the values of the newest document. While the daemon is silent, the values
-        // of the first batch are unknown.
+        // Marks the newest document as unread, so that each connection begins with a batch of its values. While the
+        // daemon is silent, there is no document, and this batch reports every value as unknown.
         documents.mark_changed();
         let Err(error) = session::run(&settings.kuksa, &mut documents, &mut stop, &mut journal).await else { break };
         let was_connected = journal.counts.connections > connections;

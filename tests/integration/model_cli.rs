@@ -176,8 +176,9 @@ fn invalid_source_error_lists_allowed_sources() {
     assert!(refused(1, &["model", "show", "--state", "config"]).contains("no history found"));
 }
 
-/// A folder with the log of a one-cell vehicle that learns its cell model from the label alone. The log contains deep
-/// swings for most of a day, and the first readings after the night.
+/// Simulates the log of a one-cell vehicle and replays it with a configuration that states only the cell's label, so
+/// that the monitor learns the cell model. Returns the folder with the log, the snapshot and the store. The log
+/// contains deep charges and discharges for most of a day, and the first readings after the night.
 fn learned() -> Place {
     let place = Place::new();
     let config = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");

@@ -1,5 +1,6 @@
 //! Tests the record of use: how long and how often temperatures, voltages and currents were beyond their limits. The
-//! monitor counts it over restarts, gaps and a new pack. Report, export and passport show it.
+//! monitor continues the record after restarts and gaps, and starts a new record when the pack is replaced. Report,
+//! export and passport show the record.
 
 use std::fs;
 use std::path::Path;

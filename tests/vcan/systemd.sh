@@ -4,10 +4,11 @@
 #
 #   systemd_prepare paper.toml            # program, units and configuration where the package puts them
 #   drop_in packwatch.service test '[Service]' 'WatchdogSec=3s'
-#   systemd_boot                          # boots and starts packwatch.service, or UNITs: `systemd_boot UNIT...`; `''`: none
+#   systemd_boot                          # boots and starts packwatch.service; `systemd_boot UNIT...` starts other units, `systemd_boot ''` none
 #   wait_for 20 "active unit" has ActiveState active
 #
-# The state is in /var/lib, as on a vehicle. If it must outlive the kernel, mount a disk there before `systemd_boot`.
+# The state is in /var/lib, as on a vehicle. It is lost when the user-mode kernel ends. To keep it, mount a disk there
+# before `systemd_boot`.
 
 [[ -x /usr/lib/systemd/systemd ]] || skip "no systemd on this machine"
 # systemd_prepare writes to /etc, /usr and /var, so run only where these changes are discarded.
@@ -17,7 +18,8 @@ repository=$(cd "$(dirname "${BASH_SOURCE[0]}")/../.." && pwd)
 units=$tmp/units # becomes /run/systemd/system: the boot mounts a new /run
 mkdir -p "$units"
 
-# systemd_prepare CONFIG: installs config/CONFIG as packwatch.toml. Removes the units' dependencies on a complete system.
+# systemd_prepare CONFIG: installs config/CONFIG as packwatch.toml. Switches off the units' default dependencies, which
+# would start a complete system.
 systemd_prepare() {
     install -D "${PACKWATCH_BIN:?names the program under test}" /usr/bin/packwatch
     [[ ! -x ${PACKWATCH_BIN%/*}/packwatch-uplink ]] || install -D "${PACKWATCH_BIN%/*}/packwatch-uplink" /usr/bin/packwatch-uplink
@@ -62,7 +64,7 @@ systemd_boot() {
     } >"$units/test.target"
     printf '[Journal]\nStorage=volatile\nRuntimeMaxUse=32M\nForwardToConsole=no\nRateLimitIntervalSec=0\n' >/etc/systemd/journald.conf
     start systemd unshare --mount --pid --fork --kill-child --mount-proc bash -c "$(declare -f systemd_init); systemd_init '$units'"
-    # bash becomes systemd in this process. The manager's socket appears later.
+    # The child bash replaces itself with systemd, which creates its private socket later.
     wait_for 20 "systemd" booted
 }
 
@@ -70,7 +72,8 @@ booted() { [[ -n $(system_process) ]] && in_system test -S /run/systemd/private;
 system_process() { pgrep -P "${pids[systemd]}" || true; }
 
 systemd_init() {
-    # The old /sys belongs to the kernel's first network namespace and does not show these interfaces.
+    # The old /sys belongs to the kernel's first network namespace and does not show the interfaces of the test's network
+    # namespace.
     mount -t sysfs sysfs /sys && mount -t tmpfs tmpfs /run && mount -t cgroup2 cgroup2 /sys/fs/cgroup
     mkdir -p /run/systemd && cp -r "$1" /run/systemd/system && rm -f /run/systemd/system/test.wants
     exec env -i container=test PATH="$PATH" /usr/lib/systemd/systemd --system --unit=test.target \

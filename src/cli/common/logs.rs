@@ -37,11 +37,12 @@ pub(crate) struct InputArgs {
     pub(crate) channels: Vec<(String, String)>,
     /// Name a CSV column, for example current=Current(A). ROLE is time, current, voltage, temperature, state or section. If
     /// the header has no unit or a wrong one, write the unit after the name: 'current=I[mA]'. If
-    /// each cell or sensor has its own column (U1, U2, ..., counted from 1), write the letter n in braces in place of
-    /// the number in NAME, and at the end of ROLE. An empty NAME means that the column does not exist
+    /// each cell or sensor has its own column (U1, U2, ..., counted from 1), one --column names them all: in NAME, replace
+    /// the number by the letter n in braces; append the same letter in braces to ROLE. An empty NAME means that the
+    /// column does not exist
     #[arg(long = "column", value_name = "ROLE=NAME", value_parser = column)]
     pub(crate) columns: Vec<(String, String)>,
-    /// Direction of positive current in a CSV [default: as the format counts, else as the state column or the voltage shows]
+    /// Direction of positive current in a CSV [default: derived from the state column, the file format or the voltage]
     #[arg(long, value_enum)]
     pub(crate) csv_sign: Option<CsvSign>,
     /// CSV table that gives the start time of each section of a CSV log. The table has two columns: the log's section

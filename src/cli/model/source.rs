@@ -17,11 +17,12 @@ use packwatch_host::failure::Failure;
 /// Selects a cell model.
 #[derive(Debug, clap::Args)]
 pub(super) struct SourceArgs {
-    /// Cell model file, configuration file, state file of --snapshot, state folder of `packwatch run`, or label as CHEMISTRY:AH,
-    /// for example nca-graphite:2.9
+    /// Cell model file, configuration file, state file of `packwatch run --snapshot`, state folder of `packwatch run`, or label
+    /// as CHEMISTRY:AH, for example nca-graphite:2.9
     #[arg(value_name = "SOURCE", required_unless_present_any = ["config", "chemistry", "state"], conflicts_with_all = ["chemistry", "state"])]
     source: Option<PathBuf>,
-    /// Configuration file whose cell model or label to show. With a state: its cell model is shown if none has been learned
+    /// Configuration file whose cell model or label to show. If a state is given too, the configuration's cell model is shown
+    /// only if the state has no learned model
     #[arg(short, long, value_name = "FILE.toml")]
     config: Option<PathBuf>,
     /// State folder of `packwatch run`; its learned model is shown

@@ -2,10 +2,11 @@
 //! messages.
 //!
 //! In: time and identifier of each received frame. Out: whether the frame is admitted. Dropped frames are counted, and
-//! a [`FloodChange`] reports when dropping starts and ends. Each message has a leaky bucket, stored as the time up to
-//! which the allowed rate is spent. A burst may have as many frames as the allowed rate permits in a tenth of a second,
-//! or two frames per multiplexer page if this is more. Nothing is allocated after the start. Messages that are not
-//! configured always pass, because they are not decoded and cost almost no time.
+//! a [`FloodChange`] reports when dropping starts and ends. Each message has a leaky bucket, stored as a time: an
+//! admitted frame advances this time by the duration of one frame at the allowed rate, and a frame is dropped if the
+//! time would lie more than one burst ahead. A burst may have as many frames as the allowed rate permits in a tenth of a
+//! second, or two frames per multiplexer page if this is more. Nothing is allocated after the start. Messages that are
+//! not configured always pass, because they are not decoded and cost almost no time.
 
 use std::num::NonZeroU32;
 
@@ -49,7 +50,8 @@ pub struct FloodCount {
     pub dropped: u64,
 }
 
-/// Spent budget and current flood of one message, from which the monitor resumes without a gap.
+/// Spent budget and current flood of one message, stored in a snapshot. They are restored only if no frame was missed
+/// since the snapshot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct FloodProgress {
     bus: BusIndex,
@@ -87,7 +89,8 @@ impl FloodGate {
         let frame_ns = (1_000_000_000 / i64::from(config.max_frames_per_s.get())).max(1);
         let bucket = |(bus, id, pages): (BusIndex, CanId, usize)| {
             let pages_ns = i64::try_from(2 * pages).unwrap_or(i64::MAX).saturating_mul(frame_ns);
-            // A burst takes at least a tenth of a second at the allowed rate, in ns.
+            // The largest burst has as many frames as the allowed rate permits in a tenth of a second (in ns), or more
+            // if the message has many pages.
             let burst_ns = 100_000_000.max(pages_ns).max(frame_ns);
             LeakyBucket { bus, id, burst_ns, spent_until: None, dropped: 0, flood: None }
         };

@@ -90,8 +90,8 @@ pub struct CellModel {
     pub spread: Option<ModelSpread>,
 }
 
-/// Standard deviations of the differences between cells and their model. The modes of the open-circuit curve are stored
-/// separately ([`AgedOcv::add_spread`]).
+/// Standard deviations of the differences between cells and their model. The shapes (modes) of the open-circuit curve's
+/// error are stored separately ([`AgedOcv::add_spread`]).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ModelSpread {
@@ -103,8 +103,8 @@ pub struct ModelSpread {
     pub slow_branch: f64,
     /// Capacity (fraction).
     pub capacity: f64,
-    /// Error of the voltage drop that is caused by the present load and by the load of the last minutes. It is a
-    /// fraction of the drop, for an average over one second.
+    /// Relative error of the voltage drop in the cell, averaged over one second. It applies to the drop caused by the
+    /// present load, and to the drop caused by the load of the last minutes.
     pub drop_sqrt_s: f64,
 }
 

@@ -15,7 +15,8 @@
 //!   constants suit cells that live for 50 cycles and for 5,000. In the linear filter, with the use t0 before the step
 //!   and t1 after the step,
 //!   Q = (w1^2 rate dt + w2^2 ln(t1 / t0)) (rate^2 + P_rate + (`TRANSIENT` / t0)^2).
-//!   The last term lets a rate leave 0 after the rise of capacity that many new cells show;
+//!   Many new cells first gain capacity, so their rate is not above 0. The last term keeps the rate uncertain enough to
+//!   rise when the loss begins;
 //! * recovery: capacity that returns during rest and is lost again in use (an Ornstein-Uhlenbeck process; measured
 //!   cells show 1 to 5 % after days of rest). Successive readings share the recovery, so ten readings within one cycle
 //!   do not count as ten independent readings;
@@ -47,15 +48,16 @@ const RATE_WALK: f64 = 1.0;
 const RATE_WALK_USE: f64 = 0.45;
 /// Capacity that a new cell gains or loses while it settles, fraction of the reference.
 const TRANSIENT: f64 = 0.03;
-/// Standard deviation of the loss since the highest level that the settling of a new cell hides, fraction of the
-/// reference.
+/// The settling of a new cell can hide loss since the highest level. Standard deviation of the hidden loss, fraction of
+/// the reference.
 const HIDDEN_LOSS: f64 = 0.002;
-/// Standard deviation of the loss that a rise since the first reading hides, relative to the rise.
+/// A rise of the capacity since the first reading can hide loss, too. Standard deviation of this hidden loss, relative
+/// to the rise.
 const HIDDEN_BY_RISE: f64 = 0.5;
-/// Largest standard deviation of a level from which a rise is counted, fraction of the reference.
+/// A rise is counted from the first level whose standard deviation is below this value, fraction of the reference.
 const KNOWN_LEVEL: f64 = 0.02;
-/// Standard deviation of the error of a reading that the reading's variance does not include, fraction of the
-/// reference. It is multiplied by the square root of the learned noise scale.
+/// The error of a reading has a part that the reading's variance does not include. Standard deviation of this part,
+/// fraction of the reference. It is multiplied by the square root of the learned noise scale.
 const NOISE: f64 = 0.003;
 /// Standard deviation of the recovery while the cell is used, fraction of the reference. It is also multiplied by the
 /// square root of the noise scale.

@@ -7,7 +7,8 @@
 use std::borrow::Cow;
 use std::io::{self, Cursor, Read};
 
-/// Length of the buffer and longest accepted line, bytes. The same length is accepted for candump logs.
+/// Length of the buffer and longest accepted line, bytes. Logs of `candump -l` have their own reader in packwatch-host,
+/// with the same limit.
 const MAX_LINE: usize = 256 * 1024;
 
 /// Byte-order marks of UTF-8, and of UTF-16 in both byte orders.

@@ -97,9 +97,10 @@ pub(super) fn candidates(signals: &[LogSignal], interfaces: &[String], label: &P
     all.into_iter().flat_map(|(quantity, evidence)| ranked(quantity, evidence, interfaces)).collect()
 }
 
-/// Returns the partition (interface and source) of a signal. Only signals of one partition form groups. Undefined
-/// fields of an answer have their own partition, because the numbers in the answer's name do not number the fields.
-/// Cells in such answers are numbered per controller, so the controller is their partition.
+/// Returns the partition (interface and source) of a signal. Only signals of one partition form groups. A field that no
+/// definition describes has a name with the numbers of its answer (service and identifier). These numbers must not
+/// count as the numbers of group members, so each answer is a partition of its own. Cell voltages in such fields are
+/// numbered across all answers of a controller, so the controller is their partition.
 fn partition(signal: &LogSignal) -> String {
     let source = match &signal.origin {
         SignalOrigin::Dbc(_) => String::new(),

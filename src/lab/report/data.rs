@@ -49,7 +49,8 @@ pub(super) struct CapacityRecord {
     pub(super) resistance: (f64, f64),
 }
 
-/// A charge that covered enough of the SOC window of the recharge period.
+/// A charge that covered the recharge window (a configured SOC range) or enough of it. The recharge period is the time
+/// for this window.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct RechargeRecord {
     pub(super) time_s: f64,
@@ -75,7 +76,8 @@ pub(super) struct ModelRecord {
     pub(super) time_s: f64,
     /// Name of a [`ModelState`](crate::monitor::ModelState).
     pub(super) state: String,
-    /// Learned capacity of the mean cell (Ah): mean and standard deviation. `None` = the label's capacity applies.
+    /// Learned capacity of the mean cell (Ah): mean and standard deviation. `None` = nothing was learned, so the rated
+    /// capacity on the cells' label applies.
     pub(super) capacity_ah: Option<(f64, f64)>,
     pub(super) residual_v: Option<f64>,
     /// Chemistry that fits better; empty = the label's chemistry fits.
@@ -106,7 +108,8 @@ pub struct Data {
     /// Time and text of other events: resets, replaced packs, and a clock that was set back.
     pub(super) incidents: Vec<(f64, String)>,
     pub(super) trace: Trace,
-    /// In a replay, size of each finding when it was first reported, by kind and first cell.
+    /// Only in a replay: size of each finding (a probable fault) at its first report. Key: kind of the fault and first
+    /// affected cell.
     pub(super) first_sizes: BTreeMap<(CellFaultKind, CellIndex), ScalarGaussian>,
     pub(super) untrusted: BTreeSet<usize>,
     /// Offset of the current sensor (A): mean and standard deviation.
@@ -175,7 +178,7 @@ impl Data {
                 let colon = if detail.is_empty() { "" } else { ": " };
                 self.incidents.push((time_s, format!("{reason}{of}{colon}{detail}")));
             }
-            // The report computes the forecast again, and takes the latest energy from the status.
+            // The report computes its own forecast, and does not show energy and power.
             HistoryTable::RemainingLife | HistoryTable::Outlook => {}
         }
     }

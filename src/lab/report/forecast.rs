@@ -18,8 +18,8 @@ const MAX_MEDIANS: f64 = 2.5;
 /// The fan is at most this many times as long as the record. It may always be as long as the median time to the end of
 /// life.
 const MAX_RECORDS: f64 = 2.0;
-/// The limit by [`MAX_MEDIANS`] is at least this multiple of the record's length, because the end of life may come much
-/// later than the median.
+/// The fan may be this many times as long as the record even if [`MAX_MEDIANS`] allows less. If the median time is
+/// short, the end of life may come much later than the median.
 const LEAST_RECORDS: f64 = 0.2;
 
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -237,7 +237,7 @@ mod tests {
         assert_eq!((outlook.cell, outlook.end_ah), (1, 1.6));
         let left = outlook.life.cycles.expect("cycles");
         // A capacity of 1.7 Ah that falls linearly by 0.006 Ah per cycle reaches the end of life after 17 full cycles.
-        // Typical cells last longer.
+        // The median may differ, because the forecast also uses a prior: typical cells last longer.
         assert!(left.low < 17.0 && left.high > 17.0 && (8.5..25.0).contains(&left.median), "{left:?}");
         let (first, last) = (outlook.fan[0], outlook.fan[POINTS - 1]);
         assert_eq!(first.time_s, data.halves.last().map(|half| half.time_s).expect("halves"));

@@ -23,7 +23,7 @@ pub struct ScoreRequest {
     pub learn: Vec<PathBuf>,
     /// Starts of the estimator in each file.
     pub start: Vec<Start>,
-    /// For a start in the middle of a file: charge taken out before the start, as a share of the full charge.
+    /// [`Start::Middle`] skips the rows until this fraction of the full charge has been discharged.
     pub remove: f64,
     /// Errors of the initial SOC (points); `None` = no initial SOC.
     pub soc_error_points: Vec<Option<f64>>,
@@ -52,8 +52,9 @@ pub struct ScoreRequest {
     pub threshold_ah: f64,
     /// Number of discharges at the start of a life that are left out of the statistics.
     pub skip_cycles: usize,
-    /// Smallest and largest size of a window, as a share of the charge of a half-cycle. The monitor receives only the
-    /// rows in the windows; `None` = it receives all rows.
+    /// If set, the monitor receives only the rows in one random window of each half-cycle. The values are the smallest
+    /// and the largest size of a window, as fractions of the charge that flows in the half-cycle. `None` = the monitor
+    /// receives all rows.
     pub window: Option<(f64, f64)>,
     /// Seeds of the windows.
     pub seeds: Vec<u64>,

@@ -70,8 +70,8 @@ struct Grid {
 }
 
 impl Grid {
-    /// Chooses the widest cells with which all cells fit into `lines` rows and into four rows. If no such width exists,
-    /// chooses cells of one character. If the rows still do not fit, the map scrolls.
+    /// Chooses the largest cell width with which the grid has at most four rows, and at most `lines` rows. If no such
+    /// width exists, a cell is one character wide. If the rows still do not fit, the map scrolls.
     fn new(cells: usize, width: usize, lines: usize) -> Self {
         let with = |cell_width: usize| {
             let fit = (width.saturating_sub(LABEL) / cell_width).max(1);

@@ -83,8 +83,8 @@ pub enum GroupFrame {
 
 /// The sender that is used for each group. It is the first address that sends the group, or the configured source
 /// address as soon as this address sends the group. If the sender is silent for 5 s, for example because it claimed a
-/// new address, an address that was never heard before replaces it. An address that was heard besides the sender
-/// belongs to another node.
+/// new address, an address that was never heard before replaces it. An address that has already sent the group belongs
+/// to another node, so it does not replace the sender.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct GroupSenders {
     chosen: Vec<ChosenSender>,

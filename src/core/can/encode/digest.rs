@@ -1,7 +1,7 @@
 //! Encodes the digest frame: number and checksum of all raised alarms, the state of every rule, and one threshold in
 //! full precision.
 //!
-//! In: raised alarms with the codes in their frames, states of the rules, a threshold. Out: frames of
+//! In: raised alarms as wire codes (the codes in an alarm frame), states of the rules, a threshold. Out: frames of
 //! `PACKWATCH_Digest`. With the checksum, a receiver detects that its table of raised alarms is incomplete, for example
 //! because alarm frames were lost or the receiver started late.
 
@@ -62,7 +62,8 @@ pub struct DigestFields {
 pub struct TableChecksum(u16);
 
 impl TableChecksum {
-    /// Adds a raised alarm with the codes of its frame. `cell` is `None` for the whole pack.
+    /// Adds a raised alarm. `rule`, `severity` and `state` are the wire codes in its alarm frame. `cell` is `None` for
+    /// the whole pack.
     pub fn add(&mut self, rule: u8, severity: u8, cell: Option<CellIndex>, state: u8, is_acknowledged: bool) {
         // 2047 = the whole pack, as in the alarm frame.
         let [low, high] = cell.map_or(2047, |cell| cell.0).to_le_bytes();

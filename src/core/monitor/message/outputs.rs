@@ -15,8 +15,9 @@ pub struct Transmit {
     pub time: Timestamp,
     pub bus: BusIndex,
     pub frame: Frame,
-    /// Whether the frame announces a learned value or an alarm change. True for all health, alarm and J1939 frames. All
-    /// frames of one identifier and all parts of one transfer therefore have the same flag.
+    /// Whether frames of this kind can announce a new result (a learned value or an alarm change), so that they wait
+    /// until the result is stored. True for all frames except status frames, freshness frames and diagnostic requests.
+    /// All frames of one identifier and all parts of one transfer therefore have the same flag.
     pub announces: bool,
     /// How to authenticate the frame; `None` = the frame is not authenticated. The frame already contains its
     /// freshness, and zeros in place of the authenticator.

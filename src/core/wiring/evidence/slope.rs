@@ -7,7 +7,8 @@
 use super::series::Series;
 use crate::filter::median;
 
-/// Minimum duration of a longer step (s). A car's load changes within a second.
+/// If the current hardly explains the steps between consecutive readings ([`LEAST_R2`]), steps of at least this duration
+/// (s) are used. A car's load changes within a second.
 const LEAST_STEP_S: f64 = 1.0;
 /// If the current explains less than this share of the voltage changes between consecutive readings, longer steps are
 /// used.

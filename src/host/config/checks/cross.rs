@@ -112,7 +112,7 @@ fn balancing(raw: &RawTables, model: Option<&CellModel>) {
     if !pack.balancing {
         pack.place.fault("balancing", "must be true if [input.balancing] is given");
     }
-    // The usual current of passive balancing is at most a few hundredths of the rated capacity per hour.
+    // Passive balancing usually bleeds at most a few hundredths of 1 C. Only an implausible current exceeds C/5.
     let most_a = raw.rated_ah(model).map(|rated_ah| 0.2 * rated_ah * f64::from(pack.strings));
     if let Some(most_a) = most_a.filter(|most_a| keys.bleed_a > *most_a) {
         let what = format!("must be at most {most_a:?} A (C/5 of the pack's rated capacity)");
@@ -183,8 +183,9 @@ fn health(raw: &RawTables, model: Option<&CellModel>) {
         recharge.place.fault(key, if key == "to_soc" { &what } else { &other });
     }
     if let (Some(capacity), Some(estimator)) = (&raw.capacity, &raw.estimator) {
-        // The paper's filter keeps the capacity constant between half-cycles, while packwatch's filter estimates the
-        // capacity. A combination of the two methods is not supported.
+        // With the methods of the paper that packwatch follows ("nominal" and "held"), the filter keeps the capacity
+        // constant between half-cycles. With packwatch's own methods ("swing" and "joint"), the filter estimates the
+        // capacity. A mixture of the two pairs is not supported.
         let (key, needed) = match (capacity.method, estimator.capacity_state) {
             (MethodKey::Swing, CapacityState::Joint) | (MethodKey::Nominal, CapacityState::Held) => ("", ""),
             (MethodKey::Swing, CapacityState::Held) => ("swing", "joint"),

@@ -153,8 +153,8 @@ pub(crate) use table_field;
 ///
 /// Each table is `one`, `optional` or `many`. A table marked `one` is always read: if the file does not contain it, its
 /// keys have their defaults, and missing required keys are reported. A table marked `optional` is read only if the file
-/// contains it. A table marked `many` is repeatable (`[[path]]`). `with` names the type of a table that a key of the
-/// table contains.
+/// contains it. A table marked `many` is repeatable (`[[path]]`). If the value of a key is itself a list of tables,
+/// `with` names the type of these inner tables.
 macro_rules! tables {
     ($(#[$about:meta])* $name:ident, $sections:ident { $($field:ident: $kind:ident $section:ident $(with $below:ident)?),+ $(,)? }) => {
         $(#[$about])*

@@ -31,7 +31,8 @@ pub(crate) fn wait_for(what: &str, mut is_so: impl FnMut() -> bool) {
     }
 }
 
-/// Builds a document of the daemon `second` seconds after the first. Cell `n` has a voltage of 3.6 V plus `n` mV.
+/// Builds a status document of the daemon. Its time is `second` seconds after the time of the first document. Cell `n`
+/// has a voltage of 3.6 V plus `n` mV.
 pub(crate) fn document(cells: usize, second: i64) -> Value {
     let mut document: Value = serde_json::from_str(include_str!("../data/status.json")).unwrap();
     let time = START_NS + second * 1_000_000_000;

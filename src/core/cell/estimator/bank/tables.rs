@@ -1,4 +1,4 @@
-//! Holds a cell model's tables in the form that the kernel reads.
+//! Holds a cell model's tables in the form that the filter's vector code ([`super::kernel`]) reads.
 //!
 //! A row has a line (value at SOC 0, and slope) for every quantity in one SOC interval, so one look-up gives all
 //! quantities without a division. Temperatures change slowly, and several cells share a temperature. The rows of a
@@ -17,7 +17,8 @@ use crate::filter::simd::Lanes;
 /// Index of the open-circuit voltage (V) in a row. Each value is followed by its slope (per unit of SOC).
 pub(super) const OCV_V: usize = 0;
 /// Index of the change of the open-circuit voltage with the capacity (V per Ah); the change is 0 if the curve does not
-/// age. The changes per standard deviation of each mix of losses (V) follow.
+/// age. The changes of the open-circuit voltage by each mix (V) have the next indices. A mix states how uncertain the
+/// aged curve is ([`crate::cell::aged_ocv`]).
 pub(super) const OCV_PER_AH: usize = 2;
 pub(super) const R0_OHM: usize = OCV_PER_AH + 2 + 2 * MIXES;
 /// Index of the voltage error (V); 0 if the model states no error.
@@ -228,7 +229,7 @@ impl<const W: usize> Tables<W> {
         }
     }
 
-    /// Computes the lines of a lane that depend on the capacity of the open-circuit curve (Ah).
+    /// Computes the lines of a lane that change with ageing, for a cell of this capacity (Ah).
     fn age<const L: usize>(&self, capacity_ah: f64, lines: &mut CachedLines<L, W>, lane: usize) {
         let OffsetLine { offset_v, per_ah_v, mixes_v } =
             self.model.aged_ocv.line(&self.model.soc, lines.interval[lane], capacity_ah);
@@ -287,8 +288,7 @@ impl<'a, const L: usize, const W: usize> TablePoint<'a, L, W> {
         (self.row[OCV_V] + slope_v * self.soc, slope_v, self.one(R0_OHM))
     }
 
-    /// Changes of the open-circuit voltage: with the capacity (V per Ah) and per standard deviation of each mix of
-    /// losses (V).
+    /// Changes of the open-circuit voltage: with the capacity (V per Ah), and by each mix (V).
     #[inline(always)]
     pub(super) fn ocv_changes(&self) -> [Lanes<L>; 1 + MIXES] {
         std::array::from_fn(|i| self.row[OCV_PER_AH + 2 * i] + self.row[OCV_PER_AH + 2 * i + 1] * self.soc)
