@@ -1,5 +1,5 @@
-//! Measures the time of one estimator step. Also measures how long the core, from input frames to output frames, takes
-//! for one reading of each cell of a 96-cell pack.
+//! Measures the time of one estimator step. Also measures the time that the core takes, from input frames to output
+//! frames, for one reading of each cell of a 96-cell pack.
 
 use common::{example, reading};
 use packwatch_host::can::encode::InputEncoder;

@@ -1,9 +1,10 @@
 //! Runs the workloads (parser, decoder, estimator) whose instructions `tests/instructions` counts.
 //!
-//! `instructions WORK PASSES` runs one of [`WORKS`] PASSES times over the same inputs. It prints the number of units
-//! per pass and the processor's SIMD extensions (such as AVX2), which select the estimator's code. `tests/instructions`
-//! counts the instructions of two runs, the second with twice the passes. The difference excludes start-up. Without
-//! arguments, as under `cargo bench`, the program prints the time of each workload.
+//! `instructions WORK PASSES` runs one of [`WORKS`] over the same inputs, PASSES times. It prints the number of units
+//! (lines, frames or steps) per pass. It also prints the processor's SIMD extensions (such as AVX2), because the
+//! estimator selects its code by them. `tests/instructions` counts the instructions of two runs, the second with twice
+//! as many passes. The difference between the two counts excludes the start of the program. Without arguments, as under
+//! `cargo bench`, the program prints the time of each workload.
 #![expect(clippy::print_stdout, reason = "a program whose output is read by tests/instructions")]
 
 use std::hint::black_box;
@@ -114,7 +115,7 @@ fn parse_and_decode() -> Work {
     })
 }
 
-/// Calls `take` for each frame of a log. The lines are read, parsed and given times as in `replay`.
+/// Calls `take` for each frame of a log. As in `replay`, the lines are read and parsed, and each frame gets its time.
 fn each_frame(log: &NamedTempFile, mut take: impl FnMut(BusIndex, &Frame)) {
     let options = LogOptions {
         interfaces: vec!["can0".to_owned()],

@@ -8,8 +8,8 @@ folder. Each task runs `packwatch fleet run` for its vehicle, which writes DIR/V
 repeated task or a restarted job costs little. Other options, such as --csv-sign=charge, are passed on. If a vehicle fails, even by a
 crash of the program, its row has the reason and the job continues.
 
-Afterwards run `packwatch fleet merge DIR -o TABLES --manifest MANIFEST`. Prints a line for each failed vehicle, and the counts. The exit
-status is 0 even if vehicles failed. To get the rows as a DataFrame in a program, call `replay`.
+Afterwards run `packwatch fleet merge DIR -o TABLES --manifest MANIFEST`. This program prints a line for each failed vehicle, and the
+counts. The exit status is 0 even if vehicles failed. To get the rows as a DataFrame in a program, call `replay`.
 """
 
 import argparse
@@ -31,7 +31,7 @@ def replay_vehicle(line: str, command: list[str]) -> dict:
         manifest.write(line)
         manifest.flush()
         ran = subprocess.run([*command, manifest.name], capture_output=True, text=True, errors="replace", check=False)
-    # With status 1, the document states why the vehicle failed.
+    # With status 1, the JSON document states why the vehicle failed.
     if ran.stdout.startswith("{"):
         (found,) = json.loads(ran.stdout)["vehicles"]
         row |= {"outcome": found["outcome"], "error": found["record"]["error"], "days": found["record"]["days"]}

@@ -1,8 +1,8 @@
 //! packwatch: streaming battery health monitoring over SocketCAN.
 //!
 //! # Map
-//! Each folder under `src` is a crate, so the compiler enforces which crate may use which. Only `src/cli` is a module
-//! of this crate. A folder inside a crate is a module. A module uses only modules above it in this table
+//! Each folder under `src` is a crate, so the compiler enforces which crates a crate may use. Only `src/cli` is a
+//! module of this crate. A folder inside a crate is a module. A module uses only modules above it in this table
 //! (`tests/integration/layering.rs` checks this rule).
 //!
 //! | crate | module | content |
@@ -19,14 +19,14 @@
 //! | | [`sim`] | simulated truth, sensor errors, scenarios |
 //! | | [`wiring`] | evidence from signal values (`evidence`); checks wiring and configuration against recorded frames |
 //! | `src/regress` | `regress` | Gaussian process regression: pure numbers (feature `lab`) |
-//! | `src/host` | `bounded_file` | reads a file that describes something, up to a limit |
+//! | `src/host` | `bounded_file` | reads files of limited size: configurations, DBC files, cell models, states, keys |
 //! | | [`config`] | TOML to validated settings; reports all faults at once |
 //! | | [`io`] | log files, CSV, CAN sockets, clock, journal, result and event files |
 //! | | [`logging`] | log lines |
 //! | | [`control`] | command socket |
 //! | | [`store`] | learned state in two files, history in SQLite |
 //! | | [`status`] | status document, metrics |
-//! | | [`service`] | the live loop: links, ticks, readiness, reload, watchdog |
+//! | | [`service`] | the live loop: interfaces, ticks, readiness, reload, watchdog |
 //! | | `http` | HTTP server of the exporter and of the uplink |
 //! | | [`exporter`] | live page, metrics for Prometheus |
 //! | | [`replay`] | the loop over recorded logs |

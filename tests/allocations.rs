@@ -1,6 +1,6 @@
 //! Checks that processing a frame allocates no memory in steady state, in the log reader and in the core with the 96
 //! cells of `config/example.toml`. Allocations are permitted in four cases: the first frames (buffers grow),
-//! transitions between charge, discharge and rest, events, and the end of a row of the diagnosis.
+//! transitions between charge, discharge and rest, events, and the end of a row of the diagnosis (`BLOCKS_OF_A_ROW`).
 //!
 //! All threads of the process are counted. If a test fails, `dhat-heap.json` shows the allocations.
 
@@ -18,7 +18,7 @@ use packwatch::monitor::{Monitor, Outputs, Record, RecordKind, TICK_PERIOD_MS};
 #[global_allocator]
 static ALLOCATOR: dhat::Alloc = dhat::Alloc;
 
-/// If a gap in the log is longer (s), the recorder counts as asleep. This log has no gap.
+/// If the log has a gap longer than this (s), the replay assumes that the recorder slept. This log has no gap.
 const SLEEP_GAP_S: f64 = 30.0;
 /// Length of the log (s).
 const LOG_S: f64 = 160.0;
@@ -27,8 +27,8 @@ const WARM_S: f64 = 110.0;
 /// The 50 s after the warm-up contain more: 10 currents and 32 other frames every 100 ms.
 const MIN_FRAMES: u64 = 20_000;
 
-/// Limit at the end of a row with 96 cells. A row holds the sums of each cell's samples over a few minutes, from which
-/// the diagnosis computes its findings.
+/// Maximum number of blocks allocated at the end of a row with 96 cells. A row holds the sums of each cell's samples
+/// over a few minutes, from which the diagnosis computes its findings.
 const BLOCKS_OF_A_ROW: u64 = 64;
 
 /// Each test counts the allocations of the whole process, so they must not run in parallel.

@@ -113,7 +113,7 @@ fn verdict(warnings: usize) -> String {
     }
 }
 
-/// Appends a heading and indented lines. If `lines` is empty, appends the text `none` instead of them.
+/// Appends a heading and the indented `lines`. If `lines` is empty, appends the text in `none`.
 fn list(heading: &str, lines: &[String], none: &str, page: &mut String) {
     page.push_str(&format!("\n{heading}\n"));
     for line in lines.iter().map(String::as_str).chain(Some(none).filter(|none| lines.is_empty() && !none.is_empty())) {
@@ -126,7 +126,8 @@ fn table(rows: impl Iterator<Item = Vec<String>>) -> Vec<String> {
     output::table::<&str>(&[], rows, usize::MAX).lines().map(str::to_owned).collect()
 }
 
-/// The row of a signal. `has_direction` states whether the current is a magnitude.
+/// The row of a signal. If `has_direction` is true, the current is a magnitude, and another signal states its
+/// direction.
 fn signal(signal: &SignalUse, has_direction: bool) -> Vec<String> {
     let page = if signal.multiplex.is_empty() { String::new() } else { format!(" [{}]", signal.multiplex) };
     let mut notes = Vec::new();

@@ -82,7 +82,7 @@ pub(crate) enum Positive {
 }
 
 impl Known {
-    /// Whether the user describes the battery, and not only its frames.
+    /// Whether an option describes the battery itself. (DBC files and signal sets describe only its frames.)
     pub(crate) fn has_answers(&self) -> bool {
         self.label.is_some() || self.model.is_some() || self.positive.is_some()
     }
@@ -276,7 +276,7 @@ fn row(candidate: &Candidate) -> Vec<String> {
     vec![rank, candidate.signal.clone(), candidate.interface.clone(), values(candidate), reasons]
 }
 
-/// Values of a candidate in the log: "16 of 3.188 to 3.392 V".
+/// Number of signals of a candidate and range of their values in the log: "16 of 3.188 to 3.392 V" for 16 signals.
 pub(crate) fn values(candidate: &Candidate) -> String {
     let unit = candidate.quantity.unit();
     let (low, high) = (number(candidate.low), number(candidate.high));

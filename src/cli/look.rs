@@ -1,9 +1,9 @@
 //! `packwatch look`: from logs to a verdict in one command.
 //!
 //! Finds the battery's signals in the logs, makes a configuration from them, checks the wiring, and replays the logs
-//! into a report. For a table, the label replaces the search for signals. If the logs and the label leave a question
-//! open, the command prints the question and the option that answers it. The exit code is 0 if a report was written,
-//! and 1 otherwise.
+//! into a report. For a table of samples, no signals are searched: the label describes the battery. If the logs and the
+//! label leave a question open, the command prints the question and the option that answers it. The exit code is 0 if a
+//! report was written, and 1 otherwise.
 
 mod table;
 

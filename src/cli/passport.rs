@@ -1,5 +1,5 @@
-//! `packwatch passport`: writes a battery passport as JSON. The passport merges measured values, from a store or a
-//! replay, with the manufacturer's part.
+//! `packwatch passport`: writes a battery passport as JSON. The passport merges values that packwatch measured (from a
+//! store or a replay) with values that the manufacturer states in a file.
 
 use std::cell::RefCell;
 use std::fs::File;

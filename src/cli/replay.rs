@@ -37,7 +37,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         None => replay_all(args, &mut source, config, settings),
     };
     match result {
-        // If the reader has closed the output early, this is not an error.
+        // It is not an error if the reader of the output has closed it early.
         Err(ReplayError::Write(error)) if error.kind() == io::ErrorKind::BrokenPipe => Ok(()),
         result => result.map_err(failure),
     }

@@ -1,4 +1,5 @@
-//! `packwatch rul`: forecasts the remaining useful life from measured capacity histories, now or at points of the life.
+//! `packwatch rul`: forecasts the remaining useful life from measured capacity histories, either at the end of the
+//! history or at earlier points of it.
 
 mod report;
 

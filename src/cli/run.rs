@@ -76,7 +76,7 @@ pub(crate) struct Args {
     status: Option<PathBuf>,
 }
 
-/// Largest receive buffer, bytes: half the kernel's limit, because the kernel doubles the requested size.
+/// Largest receive buffer (bytes): half of the kernel's limit, because the kernel doubles the requested size.
 const MAX_BUFFER_BYTES: usize = (i32::MAX / 2) as usize;
 
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {

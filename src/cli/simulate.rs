@@ -180,8 +180,8 @@ fn wiring(sample: &SampleConfig) -> Wiring {
     Wiring { strings: sample.strings.max(1), temperature_at: (0..sample.sensors()).map(cell_of).collect() }
 }
 
-/// Encodes the frames of one sample. The frames with the current come first, because this current causes a part of the
-/// voltages.
+/// Encodes the frames of one sample. The frames with the current come first, because the voltages depend on this
+/// current.
 struct FrameMaker {
     encoder: InputEncoder,
     protector: InputProtector,

@@ -87,7 +87,7 @@ fn protection(report: &ChannelReport) -> String {
     format!("BROKEN: {}", found.collect::<Vec<_>>().join(", "))
 }
 
-/// One state for each wire code.
+/// The alarm states that an alarm frame can contain, one for each code of its state signal.
 const ON_THE_WIRE: [AlarmState; 7] = [
     AlarmState::Inactive,
     AlarmState::Active,

@@ -1,5 +1,5 @@
-//! `packwatch mqtt`, `kuksa`, `sovd` and `vss`: replace this process by the program `packwatch-uplink`, which is in a separate
-//! package.
+//! `packwatch mqtt`, `kuksa`, `sovd` and `vss`. These commands replace this process by the program `packwatch-uplink`,
+//! which is in a separate package.
 //!
 //! `packwatch-uplink` is searched for first in the folder of this program, then in `PATH`.
 

@@ -16,7 +16,7 @@
 //! | intake | frame → readings, command | `monitor/stage/intake.rs` | [`can`]: flood limit, protection, decoding |
 //! | sampling | reading → cell sample | `monitor/stage/sampling.rs` | [`sample`]: limits, ages, charge |
 //! | estimation | cell samples → estimates | `monitor/stage/estimation/batch.rs`, `monitor/stage/estimation.rs` | [`cell`], [`filter`] |
-//! | modelling | filter steps, rest voltages → the cells' own model | `monitor/stage/modelling.rs` | [`cell`]: notebook, own model |
+//! | modelling | filter steps, rest voltages → the cells' own model, learned on board | `monitor/stage/modelling.rs` | [`cell`]: notebook, own model |
 //! | findings | cell samples, estimates → findings, values for the rules that compare a cell with its pack | `monitor/stage/findings.rs` | [`cell_faults`]: each cell against its pack |
 //! | learning | pack current, estimates → health values | `monitor/stage/learning.rs`, `monitor/stage/learning/life.rs` | [`health`] |
 //! | alarming | values → changes of alarms | `monitor/stages/watch.rs`, `monitor/stage/alarming.rs` | [`alarm`] |

@@ -191,7 +191,7 @@ pub enum Channel {
     ReportedSoh,
     /// The vehicle's 12 V or 24 V supply (V). If it is too low, no diagnostic requests are sent.
     SupplyVoltage,
-    /// Whether the BMS bleeds a cell; 0 = no. For the cell-fault detector only.
+    /// Whether the BMS bleeds a cell (discharges it for balancing); 0 = no. For the cell-fault detector only.
     Balancing(CellIndex),
     /// Serial number or another number that identifies the pack.
     PackIdentity,

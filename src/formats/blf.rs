@@ -22,7 +22,7 @@ use crate::{Channel, Item, LogReader, Position, Source};
 pub(crate) const MAGIC: &[u8] = b"LOGG";
 /// First bytes of an object.
 const MARK: &[u8] = b"LOBJ";
-/// Size of the header's fields used here, and the smallest possible header, bytes.
+/// Number of header bytes that are used here. It is also the size of the smallest possible header.
 const HEADER_FIELDS: usize = 56;
 /// Size of an object's first part, bytes.
 const OBJECT_HEAD: usize = 16;

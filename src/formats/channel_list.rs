@@ -7,12 +7,12 @@ use crate::Channel;
 pub(crate) struct ChannelList(Vec<Channel>);
 
 impl ChannelList {
-    /// Index of a channel that the log counts from `first`; `None` if the list is full.
+    /// Index of a channel in a log that numbers its channels from `first`; `None` if the list is full.
     pub(crate) fn of_number(&mut self, written: u32, first: u32) -> Option<u8> {
         self.index_of(&Channel::Number { written, index: written.saturating_sub(first) })
     }
 
-    /// Index of a channel whose number says nothing about its order; `None` if the list is full.
+    /// Index of a channel in a log whose channel numbers do not show an order; `None` if the list is full.
     pub(crate) fn of_label(&mut self, written: u32) -> Option<u8> {
         let is_same = |known: &Channel| matches!(known, Channel::Number { written: number, .. } if *number == written);
         let index = self.0.iter().position(is_same).unwrap_or(self.0.len());

@@ -10,7 +10,7 @@ use packwatch_core::quantity::Timestamp;
 pub enum Item {
     /// A data frame or a remote frame, received or sent by the recorder.
     Frame {
-        /// Stamp: Unix time if the log states a date, otherwise the time since the start of the log.
+        /// Time of the frame: Unix time if the log states a date, otherwise the time since the start of the log.
         time: Timestamp,
         /// Index into [`LogReader::channels`](crate::LogReader::channels).
         channel: u8,
@@ -19,7 +19,7 @@ pub enum Item {
     },
     /// An error frame.
     ErrorFrame {
-        /// Stamp, as for frames.
+        /// Time of the error, stated as for a frame.
         time: Timestamp,
         /// Index into [`LogReader::channels`](crate::LogReader::channels).
         channel: u8,

@@ -2,8 +2,8 @@
 //!
 //! In: the bytes of a file. Out: [`Item`]s in the order of the file, with their channel. [`Format::recognise`] finds
 //! the format from the first bytes; the file name is not used. Every reader streams: its memory does not depend on the
-//! size of the file. A bad part becomes [`Item::Bad`], and reading continues after it. A file that ends too early, or
-//! whose structure is damaged, ends with an error after all frames before the damage.
+//! size of the file. A bad part becomes [`Item::Bad`], and reading continues after it. If a file ends too early or its
+//! structure is damaged, the reader returns all frames before the damage, and then an error.
 //!
 //! [`Mf4Writer`] writes frames as MF4, for other tools.
 //!

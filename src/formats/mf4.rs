@@ -4,8 +4,8 @@
 //! Sorted groups are read in parallel and merged by their times. Unsorted data contain the records of several groups
 //! one after another; these are returned in the order of the file. Unfinalized files, whose recorder lost its supply,
 //! are read up to their end. If the data of one group are damaged, the other groups are still read, and the damage is
-//! reported after the last frame. Sources: ASAM MDF 4.1 and its bus-logging standard, as far as the files of CANedge,
-//! asammdf and python-can show them.
+//! reported after the last frame. Source: files of CANedge, asammdf and python-can, which show the parts of
+//! ASAM MDF 4.1 and of its bus-logging standard that this reader needs.
 
 mod blocks;
 mod data;

@@ -1,8 +1,8 @@
 //! Reads PCAP and PCAPNG files: packet captures of SocketCAN by tcpdump, Wireshark and others.
 //!
 //! Packets of the link type SocketCAN become frames. Packets of the cooked link types of Linux become frames if their
-//! protocol is CAN or CAN FD. Other packets give items without a frame. Sources: the capture file formats and link
-//! types as published by the tcpdump group.
+//! protocol is CAN or CAN FD. For other packets, the reader returns an item without a frame. Sources: the capture file
+//! formats and link types as published by the tcpdump group.
 
 mod next_generation;
 mod packet;
@@ -61,7 +61,7 @@ impl PcapReader {
         if head.len() < FILE_HEAD {
             return Err(cut(format!("the file ends in its header after {} bytes, must have {FILE_HEAD}", head.len())));
         }
-        // The upper bits describe a frame check sequence.
+        // The upper 16 bits describe a frame check sequence; the lower 16 bits are the link type.
         let number = u32_at(head, 20, form.big_endian) & 0xFFFF;
         let link = LinkType::of_number(number);
         if link.is_none() {

@@ -1,4 +1,4 @@
-//! A frame as binary logs state it: number, flags and bytes, not yet checked.
+//! A frame as a binary log contains it: identifier, flags and bytes, not yet checked.
 
 use packwatch_core::can::{CanId, Frame};
 
@@ -13,7 +13,7 @@ pub(crate) struct RawFrame<'a> {
     pub(crate) extended: bool,
     /// Remote frame: its requested length is the length of `data`, whose content is ignored.
     pub(crate) remote: bool,
-    /// CAN FD: bit rate switch and error state indicator.
+    /// Bit rate switch and error state indicator of a CAN FD frame; `None` = a classic frame.
     pub(crate) fd: Option<(bool, bool)>,
     pub(crate) data: &'a [u8],
 }

@@ -8,7 +8,7 @@
 //! * `/report`: the report of the daemon's store, if this program can make reports.
 //! * If the exporter listens on a network address, the page and the events require a token ([`Access`]).
 //! * [`http`] limits connections and request heads.
-//! * The signals of [`Stop`] stop the exporter cleanly.
+//! * The signals that [`Stop`] handles stop the exporter cleanly.
 
 mod access;
 mod live;
@@ -61,8 +61,8 @@ struct Site {
     report_permit: Arc<Semaphore>,
 }
 
-/// Follows the status of the daemon with the status socket `socket`, and serves it on the address `listen` until a
-/// signal stops the exporter. `token_file` is the file with the token that clients must know.
+/// Follows the status of the daemon whose status socket is `socket`, and serves this status on the address `listen`
+/// until a signal stops the exporter. `token_file` is the file with the token that clients must know.
 ///
 /// # Errors
 /// Fails if the token cannot be read, or if the address cannot be bound.

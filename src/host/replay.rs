@@ -1,8 +1,9 @@
 //! The replay loop reads records, runs the core, writes results and returns a summary.
 //!
-//! Guarantee: the same logs and configuration give the same result files, byte for byte. The replay of a journal gives
-//! the results of the run that recorded it. Plain logs and CSV get the ticks of [`Ticks`]; journals already contain
-//! ticks. Wall time is used only for pacing (`speed`) and for reports.
+//! Guarantee: the same logs and configuration give the same result files, byte for byte. The replay of a journal (all
+//! inputs that a running daemon has recorded) gives the results of the recorded run. A journal contains the ticks
+//! (periodic inputs that advance the time) of this run. For plain logs and CSV, [`Ticks`] creates the ticks. Wall time
+//! is used only for pacing (`speed`) and for reports.
 
 use std::collections::BTreeMap;
 use std::io::{self, Write};

@@ -2,8 +2,8 @@
 //!
 //! In: frames and states of the interfaces, ticks, commands. Out: frames, events, status. One task owns the core. Every
 //! input is written to the journal before the core handles it, so that a replay of the journal produces the same
-//! frames. No fault of a bus, a disk or the service manager ends the loop. The signals of
-//! [`Stop`] end the loop cleanly.
+//! frames. No fault of a bus, a disk or the service manager ends the loop. The signals that [`Stop`] handles end the
+//! loop cleanly.
 
 mod engine;
 mod j1939_carrier;

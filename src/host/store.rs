@@ -1,9 +1,10 @@
 //! Stores state and history so that they survive restarts and power cuts: in two state files and a history database, in
 //! one folder.
 //!
-//! * Learned results and alarm changes are written to disk before they are announced. An announcement waits at most 200
-//!   ms for the disk ([`commit_barrier`]). Learned results are stored with the whole state. An alarm change is stored
-//!   as a small row of the history. A start restores the newest state, then reapplies newer alarm changes (`learned`).
+//! * Learned results and alarm changes are written to disk before they are announced (sent in frames). An announcement
+//!   waits at most 200 ms for the disk ([`commit_barrier`]). Learned results are stored with the whole state. An alarm
+//!   change is stored as a small row of the history. A start restores the newest state, then reapplies newer alarm
+//!   changes (`learned`).
 //! * Rows are committed before the state that contains them (`writer`). If the power is cut between these two writes,
 //!   the results in these rows were not announced. The next start reapplies the alarm changes in the rows. Learned
 //!   results are learned again and get a second row. A pack change is not undone: the history shows that the pack of
@@ -140,8 +141,8 @@ pub struct Store {
 }
 
 impl Store {
-    /// Opens the store. Returns no store if the store is disabled, or if the folder is a default folder that systemd
-    /// did not create and that cannot be used.
+    /// Opens the store. Returns no store if the store is disabled. Also returns no store if a default folder cannot be
+    /// used, unless systemd created this folder.
     ///
     /// # Errors
     /// Fails if another daemon uses the folder.
@@ -229,7 +230,8 @@ impl Store {
         &self.folder
     }
 
-    /// Keeps a stored state that could not be restored, until a start can restore it. `why` is recorded in the history.
+    /// Sets aside a stored state that could not be restored, and keeps it until a later start can restore it. `why` is
+    /// recorded in the history.
     pub fn set_state_aside(&self, why: &str, now: Timestamp) {
         tracing::error!(error = why, "stored state {SET_ASIDE}");
         let row = HistoryRow::Own { reason: "state_unfit", detail: format!("{why}; {SET_ASIDE}") };
@@ -242,8 +244,8 @@ impl Store {
         self.progress.clone()
     }
 
-    /// Commits the results learned from the events of one input. Returns the ticket that the announcement must wait
-    /// for; `None` = no wait.
+    /// Commits the results learned from the events of one input. Returns the ticket (number of the commit) for which
+    /// the announcement must wait; `None` = no wait.
     pub fn learned(&mut self, events: &[Event], monitor: &Monitor, now: Timestamp) -> Option<u64> {
         let commit = self.history_filter.take(events)?;
         Some(self.submit(commit, monitor, now))
@@ -275,7 +277,8 @@ impl Store {
     }
 
     /// Writes the state of a start to both state files and waits until it is on disk, for a limited time. A power cut
-    /// right after the start, or a damaged file, then cannot make the next start use the same freshness again.
+    /// right after the start, or a damaged file, then cannot make the next start use the same freshness (counter of
+    /// authenticated frames) again.
     pub fn write_start(&mut self, monitor: &Monitor, now: Timestamp) {
         let limit = Instant::now() + MAX_FINISH;
         let mut is_stored = true;

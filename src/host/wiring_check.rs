@@ -1,5 +1,5 @@
-//! Runs the two loops of `packwatch doctor`, which pass replayed logs or live input to the core's [`WiringObserver`]
-//! and, if the configuration is valid, also to a [`Monitor`].
+//! Runs the two loops of `packwatch doctor`: one for replayed logs, one for live input. Both pass their input to the
+//! core's [`WiringObserver`] and, if the configuration is valid, also to a [`Monitor`].
 //!
 //! Listening is passive: nothing is sent. An [`Interrupt`] ends both loops early, and the report covers the input so
 //! far.

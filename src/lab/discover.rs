@@ -88,7 +88,7 @@ pub struct Discovery {
     pub seconds: f64,
     /// Number of signals with values in the log.
     pub signals: usize,
-    /// Remarks on described battery voltages and currents that never have a valid value.
+    /// Remarks on battery voltages and currents that a definition describes but that never have a valid value.
     pub remarks: Vec<String>,
     #[serde(skip)]
     log_signals: Vec<LogSignal>,
@@ -126,7 +126,7 @@ impl Discoverer {
         Ok(())
     }
 
-    /// Sets the data on the pack's label. The label decides scales that the values do not determine.
+    /// Sets the data on the pack's label. If the values fit several scales, the label decides.
     pub fn set_label(&mut self, label: PackLabel) {
         self.descriptions.label = label;
     }

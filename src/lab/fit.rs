@@ -116,8 +116,8 @@ pub struct FitOutcome {
     pub capacity_ah: f64,
     /// Lowest and highest voltage (V).
     pub voltage_v: (f64, f64),
-    /// Electrodes that explain the open-circuit curve. `None` = no known electrodes explain it, a shift of the curve is
-    /// given, or a fit to measured files has no slow test.
+    /// Electrodes that explain the open-circuit curve. `None` = no known electrodes explain the curve, the request
+    /// gives a shift of the curve, or measured files were fitted without a slow test.
     pub electrodes: Option<FittedElectrodes>,
     /// Thermal parameters; `None` = the data do not determine them.
     pub thermal: Option<Thermal>,
@@ -264,8 +264,8 @@ fn settings(request: &FitRequest, prepared: &prepare::FitInputs) -> FitSettings 
         tau_s,
         voltage_v: prepared.voltage_v,
         ocv: prepared.ocv.clone(),
-        // Without a minimum slope, relaxation that is slower than the branch would bend the top of an ageing cell's OCV
-        // down.
+        // Without a minimum slope, a voltage relaxation that is slower than the model's RC branch would bend the top of
+        // an ageing cell's OCV down.
         min_slope_v: if ageing { [(0.0, 0.2), (0.9, 1.0)].to_vec() } else { vec![] },
         deviations,
     }

@@ -2,9 +2,9 @@
 //! tables. [`vehicles`] writes the same tables for a fleet of vehicles on several machines. [`prior`] combines what the
 //! vehicles have learned about their cells.
 //!
-//! Input: a configuration, and logs in any format that `replay` reads. Each log is replayed separately, but a fleet
-//! replays all logs of a vehicle together. All cores are used. If a log cannot be replayed, the error is reported and
-//! the other logs continue.
+//! Input: a configuration, and logs in any format that `replay` reads. Each log is replayed separately, except that
+//! [`vehicles`] replays all logs of one vehicle together. All cores are used. If a log cannot be replayed, the error is
+//! reported and the other logs continue.
 
 pub mod drive;
 pub mod export;

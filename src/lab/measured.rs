@@ -1,8 +1,9 @@
 //! Reads the files of a cycler with time, current, voltage, temperature and ampere-hours.
 //!
-//! Time restarts at each new value of the part column (`cycle`, `segment` or `ref`). The column `type` names the kind
-//! of a part. An empty field becomes NaN. Rows without a time, or with a field that is not a number, are left out and
-//! counted. If more than 1 % of the rows are left out, reading fails with the error of the first of these rows.
+//! The column `cycle`, `segment` or `ref` divides a file into parts. A new value begins a part, and time restarts
+//! there. The column `type` names the kind of a part. An empty field becomes NaN. Rows without a time, or with a field
+//! that is not a number, are left out and counted. If more than 1 % of the rows are left out, reading fails with the
+//! error of the first of these rows.
 
 use std::path::{Path, PathBuf};
 
@@ -29,8 +30,8 @@ impl MeasuredFile {
     /// Reads a whole file. `options` names columns and the sign of the current; the file has one cell.
     ///
     /// # Errors
-    /// The file cannot be read, a column is missing, a field is not a number, values cannot be in their unit, or the
-    /// file has no rows.
+    /// The file cannot be read, a column is missing, more than 1 % of the rows are left out, values are impossible in
+    /// the stated unit, or the file has no rows.
     pub fn read(path: &Path, options: &CsvOptions) -> Result<Self, TableError> {
         let mut log = CsvLog::open_path(path, &CsvOptions { cells: 1, sensors: 1, series: 1, ..options.clone() })?;
         let mut parts: Vec<MeasuredPart> = Vec::new();

@@ -15,8 +15,8 @@ const POINTS: u32 = 200;
 const SHOWN_C: (f64, f64) = (-20.0, 50.0);
 /// Temperature of the line for a cold cell, degrees Celsius.
 const COLD_C: f64 = 0.0;
-/// Lowest SOC (percent) that sets the height of the y axis. Slope and resistance rise steeply below it and may leave
-/// the picture.
+/// The height of the y axis is chosen for the curve above this SOC (percent). Below it, slope and resistance rise
+/// steeply and may leave the picture.
 const STEEP_PERCENT: f64 = 12.0;
 
 /// Returns all pictures with their file names.

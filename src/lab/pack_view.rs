@@ -40,7 +40,8 @@ pub fn lines(imbalance: &Result<Imbalance, UnknownImbalance>, model: Option<&Cel
     lines.into_iter().map(|(name, value)| (name.to_owned(), value)).collect()
 }
 
-/// Returns the energy (kWh) if every cell of a string moves `part` (a fraction) of the mean cell's capacity.
+/// Returns the energy (kWh) that a string takes up or delivers if each of its cells moves `part` (a fraction) of the
+/// mean cell's capacity.
 pub fn energy_kwh(pack: &Imbalance, part: ScalarGaussian, model: &CellModel) -> ScalarGaussian {
     let string_v = mean_ocv_v(model, pack.mean_ah.mean) * (pack.cells + pack.left_out.len()) as f64;
     let ScalarGaussian { mean, variance } = pack.ah(part);

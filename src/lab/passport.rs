@@ -1,9 +1,9 @@
 //! Writes battery passports: the values that a vehicle can determine, in the formats of two standards.
 //!
 //! A [`Record`] is collected from a store or a replay, and a [`Condition`] is determined from the record. [`passport`]
-//! merges the condition's values into the part that the manufacturer wrote, and checks the result. [`details`] contains
-//! standard deviations and definitions, which the standards do not provide for. Unknown values are left out; no default
-//! replaces them.
+//! merges the condition's values into the part of the passport that the manufacturer wrote, and checks the result.
+//! [`details`] contains standard deviations and definitions, which the standards do not provide for. Unknown values are
+//! left out; no default replaces them.
 
 mod condition;
 mod document;

@@ -24,8 +24,8 @@ pub use document::{now_json, scored_json};
 pub use history::{History, MeasuredCapacity};
 pub use truth::end_of_life;
 
-/// Upper limit of an error, as a share of the life. Otherwise, a baseline that never reaches the end of life would
-/// dominate the mean.
+/// Upper limit of an error, as a share of the life. Without this limit, a baseline forecast (straight line or double
+/// exponential) that never reaches the end of life would dominate the mean.
 pub const WORST_ERROR: f64 = 1.0;
 
 /// The capacity at which a life ends.
@@ -51,7 +51,7 @@ pub struct ForecastScore {
     /// Reason for a missing forecast.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub refused: Option<String>,
-    /// Whether the relative error of the median is at most alpha.
+    /// Whether the relative error of the median is at most alpha (an argument of [`score`]).
     pub within_alpha: bool,
     /// Whether the interval contains the truth.
     pub covered: bool,

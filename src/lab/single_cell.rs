@@ -102,7 +102,7 @@ fn named_cell(files: &ConfigFiles, read: config::ReadFile<'_>) -> Result<PathBuf
         let model = table.get("pack")?.get("cell_model")?.as_str()?.to_owned();
         Some(files.main.parent().unwrap_or(Path::new("")).join(model))
     });
-    // If no model is named, the empty path has no effect. Loading then reports the missing model, unless the
-    // configuration has a chemistry.
+    // If the configuration names no model, the empty path is returned and replaces nothing. Loading then reports that
+    // the model is missing, unless the configuration has a chemistry.
     Ok(named.unwrap_or_default())
 }

@@ -1,9 +1,9 @@
 //! Converts arrays from Python. Everything that NumPy reads as real or whole numbers is accepted. An array is not
 //! copied if it is contiguous, aligned and of the right type.
 //!
-//! Masked and missing reals become NaN. Whole numbers are never rounded and never wrap around. A whole number that is
-//! missing, has a fraction or is out of range gives an error with its index. An array that does not contain numbers
-//! gives an error with its dtype.
+//! Masked and missing reals become NaN. Whole numbers are never rounded and never wrap around. If whole numbers are
+//! expected, a value that is missing, has a fraction or is out of range gives an error with its index. An array that
+//! does not contain numbers gives an error with its dtype.
 
 use arrow_array::cast::AsArray;
 use arrow_array::types::{ArrowPrimitiveType, Float64Type, UInt8Type, UInt32Type};
@@ -70,7 +70,8 @@ pub(crate) fn seconds(name: &str, values: &Bound<'_, PyAny>) -> PyResult<Reals> 
     if array.getattr("dtype")?.getattr("kind")?.extract::<String>()? != "M" {
         return column(name, values);
     }
-    // Differences in microseconds are exact until the year 2255, and keep NaT, which becomes NaN.
+    // In microseconds since 1970, a float64 is exact until the year 2255. The difference keeps NaT ("not a time"), and
+    // the division converts it to NaN.
     let since = array.sub(numpy.call_method1("datetime64", (0, "us"))?)?;
     column(name, &since.div(numpy.call_method1("timedelta64", (1, "s"))?)?)
 }
@@ -102,7 +103,8 @@ pub(crate) fn float64<'py>(name: &str, values: &Bound<'py, PyAny>) -> PyResult<B
     let array = numpy.call_method1("asanyarray", (values,)).map_err(none)?;
     check_numbers(name, &array)?;
     if !is_masked(&array)? {
-        // Convert the original object, because a column of another library knows which of its values are missing.
+        // Convert `values`, not `array`: a column of another library, such as pandas, still knows which values are
+        // missing.
         return laid_out(values, "float64").map_err(none);
     }
     let filled = array.call_method1("astype", ("float64",)).and_then(|array| array.call_method1("filled", (f64::NAN,)));

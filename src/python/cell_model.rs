@@ -11,7 +11,8 @@ use crate::arrays;
 use crate::error::{config, data, file};
 use crate::table::{Table, reals};
 
-/// SOC range of a voltage that a cell can have. A cell may be charged or discharged a little beyond its limits.
+/// A voltage is accepted if it corresponds to an SOC in this range. A cell may be charged or discharged a little beyond
+/// its limits.
 const OCV_SOC: std::ops::RangeInclusive<f64> = -0.1..=1.1;
 
 /// A cell model.

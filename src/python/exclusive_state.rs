@@ -1,9 +1,9 @@
 //! Gives one call at a time access to a monitor's state, from any thread.
 //!
 //! A call that waits does not hold the interpreter's lock. If a signal handler raises an exception, as for Ctrl-C, the
-//! wait ends. Two kinds of calls fail instead of waiting. The first is a call from a signal handler that has
-//! interrupted another call on the same thread. The second is any call after a panic, which left the state
-//! inconsistent.
+//! wait ends. Two kinds of calls fail immediately. The first is a call from a signal handler, if the handler has
+//! interrupted another call on the same thread. The second is any call after an earlier call panicked, because the
+//! state may then be inconsistent.
 
 use std::ops::{Deref, DerefMut};
 use std::sync::{Mutex, MutexGuard, PoisonError, TryLockError};
@@ -34,7 +34,7 @@ impl<S> ExclusiveState<S> {
     /// Waits for exclusive access.
     ///
     /// # Errors
-    /// Fails if an earlier call panicked, if this thread is already in a call, or if a signal handler raises an
+    /// Fails if an earlier call panicked, if a call is already running on this thread, or if a signal handler raises an
     /// exception.
     pub(crate) fn wait(&self, py: Python<'_>) -> PyResult<StateGuard<'_, S>> {
         loop {
@@ -51,7 +51,7 @@ impl<S> ExclusiveState<S> {
                 }
                 Err(TryLockError::WouldBlock) => {
                     py.check_signals()?;
-                    // Polling interval: too short for a user to notice, and much longer than one check takes.
+                    // This polling interval is too short for a user to notice, and much longer than one check takes.
                     py.detach(|| thread::sleep(Duration::from_millis(1)));
                 }
             }

@@ -1,4 +1,4 @@
-//! The Python module `packwatch._packwatch`: the library behind the command line as classes and functions.
+//! The Python module `packwatch._packwatch`. Its classes and functions use the same library as the command line.
 //!
 //! Input: paths, and NumPy or Arrow arrays (seconds, A with positive = discharge, V, degrees C). Output: Arrow tables,
 //! strings and dictionaries with the same content that the command line writes. Unknown values are null or NaN, never a
@@ -7,7 +7,7 @@
 //!
 //! | file | contents |
 //! | --- | --- |
-//! | `monitor.rs`, `replay.rs` | rows, frames and logs through the monitor |
+//! | `monitor.rs`, `replay.rs` | pass rows, frames and logs to the monitor |
 //! | `outputs.rs`, `table.rs` | estimates, events and frames as Arrow tables |
 //! | `score.rs`, `fit.rs`, `rul.rs`, `gp.rs` | the commands of these names |
 //! | `cell_model.rs` | cell models |

@@ -307,7 +307,7 @@ fn report(row: usize, work: &BackgroundTask) {
     }
 }
 
-/// Largest time (s) that does not count as another unit. It is in the year 2261, near the largest time in nanoseconds.
+/// A larger time (s) is probably not in seconds. This time is in the year 2261, near the largest time in nanoseconds.
 const MAX_TIME_S: f64 = 9.2e9;
 
 /// Converts times to seconds. `datetime64` becomes Unix time.
@@ -370,7 +370,7 @@ impl PlausibleRanges {
         Self { current_a: range(&sample.current), voltage_v, temperature_c: range(&sample.temperature), capacity_ah }
     }
 
-    /// Checks that the current moves a possible charge if the times are in seconds.
+    /// Checks that the charge moved by the current is possible. If it is not, the times are probably not in seconds.
     fn check_time(&self, time_s: &Reals, input: &RowInput) -> PyResult<()> {
         const MOST_ROWS: usize = 50_000;
         let rows = time_s.rows.min(MOST_ROWS);

@@ -80,7 +80,8 @@ impl Columns {
         self.frames.extend_from_slice(&out.frames);
     }
 
-    /// Whether an estimate at `time` may become a row, in a pack of `cells` cells.
+    /// Whether an estimate at `time` may become a row. It cannot if each of the pack's `cells` cells already has a row
+    /// in the present period.
     pub(crate) fn wants_estimates(&self, wanted: Wanted, time: Timestamp, cells: usize) -> bool {
         match wanted.period_ns {
             None => false,

@@ -18,7 +18,8 @@ pub(crate) enum EndOfLife {
     Text(String),
 }
 
-/// Forecasts the remaining life at the end of histories, or at points of the life.
+/// Forecasts the remaining life at the end of each history. With `at`, forecasts it at these fractions of the life
+/// instead, and scores the forecasts.
 #[pyfunction]
 #[pyo3(signature = (files, end_of_life, *, at=None, alpha=0.2))]
 pub(crate) fn rul<'py>(
@@ -49,8 +50,8 @@ pub(crate) fn rul<'py>(
     of_json(py, &document)
 }
 
-/// Builds the document. With `at`, it contains scored forecasts at these points of the life; otherwise, forecasts at
-/// the end of each history.
+/// Builds the document with the forecasts. Without `at`, they start at the end of each history. With `at`, they start
+/// at these fractions of the life and are scored.
 fn document(
     files: &[PathBuf],
     thresholds: &[Threshold],

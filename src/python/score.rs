@@ -9,7 +9,8 @@ use crate::arguments::{List, bytes, cell_source, of_json};
 use crate::background_task::{self, Progress};
 use crate::error::{data, of_library, of_request};
 
-/// Scores of files and cases.
+/// Scores of the estimates, one per file and case. A case states the row, the SOC and the capacity with which the
+/// estimator starts.
 #[pyclass(frozen, module = "packwatch")]
 pub(crate) struct Score(ScoreReport);
 

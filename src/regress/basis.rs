@@ -5,8 +5,8 @@
 //! rows cannot separate the terms, the result is an error.
 //!
 //! The coefficients are the ordinary least-squares solution of `W y` on `W H`, where W is a square root of `K^-1`. `G`
-//! determines the coefficients, their covariance and the squared norm of the residual. Both the exact and the
-//! nearest-neighbour form of the process compute `G`.
+//! determines the coefficients, their covariance and the squared norm of the residual. The exact Gaussian process and
+//! its nearest-neighbour approximation both compute `G`.
 
 use serde::{Deserialize, Serialize};
 

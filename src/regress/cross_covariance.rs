@@ -1,7 +1,7 @@
-//! Evaluates the kernel over pairs of rows, in blocks.
+//! Evaluates the covariance function of a Gaussian process between many rows and one point, in blocks.
 //!
-//! Input: rows in column-major order, and one point. Output: squared differences and kernel values. The caller checks
-//! the inputs.
+//! Input: rows in column-major order, and the point. Output: squared differences and covariances. The caller checks the
+//! inputs.
 
 use super::plan::{Covariance, Work};
 

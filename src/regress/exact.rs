@@ -130,7 +130,7 @@ impl Posterior {
         all
     }
 
-    /// Returns the mean at a row, and `rest` of [`Coefficients::variance`].
+    /// Returns the mean at a row, and the argument `rest` of [`Coefficients::variance`].
     fn mean(&self, row: &[f64], cross: &[f64]) -> (f64, Vec<f64>) {
         let n = self.data.len();
         let rest = |k: usize| self.data.basis.value(row, k) - dot(&self.basis_solved[k * n..][..n], cross);
@@ -138,8 +138,8 @@ impl Posterior {
         (self.coefficients.mean(self.data.basis, row) + dot(&self.alpha, cross), rest)
     }
 
-    /// Returns the residual and the measurement variance of each given row when it is left out. The coefficients of the
-    /// mean function are not fitted again.
+    /// Predicts each given row from all other rows. Returns the residual and the variance of a measurement for each
+    /// row. The coefficients of the mean function are not fitted again.
     pub(super) fn left_out(&self, rows: &[u32]) -> Vec<(f64, f64)> {
         let n = self.data.len();
         let mut all = Vec::with_capacity(rows.len());

@@ -29,14 +29,14 @@ pub struct Fold {
     pub log_marginal_likelihood: f64,
     /// Factor of the 95 % interval (see [`Model::interval_factor`](super::Model::interval_factor)).
     pub interval_factor: f64,
-    /// Jitter that the fit needed.
+    /// Jitter (a value added to the diagonal of the covariance matrices) that the fit needed.
     pub jitter: Jitter,
 }
 
 /// Result of a cross-validation.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Folds {
-    /// Prediction of every row, in the order of the rows, by the model of the fold that held out the row.
+    /// Prediction of every row, in the order of the rows. A row is predicted by the model that was fitted without it.
     pub predictions: Vec<Prediction>,
     /// Number of the fold that held out each row, from 0.
     pub fold_of_row: Vec<usize>,
@@ -53,8 +53,8 @@ pub struct PredictionScore {
     pub mean_absolute_error: f64,
     /// Fraction of the rows inside the 95 % interval.
     pub coverage_95: f64,
-    /// Fraction of the rows whose residual is at most 1.96 standard deviations of a measurement: the coverage without
-    /// calibration.
+    /// Fraction of the rows whose residual is at most 1.96 standard deviations of a measurement. This is the coverage
+    /// that the model has without a calibrated interval factor.
     pub gaussian_coverage_95: f64,
     /// Mean width of the 95 % interval, from lower to upper end.
     pub mean_width_95: f64,

@@ -1,4 +1,5 @@
-//! Finds the jitter: a small number on the diagonal that a covariance matrix needs to have a Cholesky factor.
+//! Finds the jitter: a small number that is added to the diagonal of a covariance matrix, so that the matrix has a
+//! Cholesky factor.
 //!
 //! Input: a function that tries to factorise with a given jitter. Output: the smallest sufficient jitter of those
 //! tried, as a fraction of the signal variance, or an error.
@@ -15,7 +16,8 @@ pub(super) const LAST: f64 = 1e-4;
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Jitter {
-    /// Number of matrices that needed jitter in the final likelihood. Jitter in predictions is not counted.
+    /// Number of matrices that needed jitter when the final likelihood was computed. Jitter in predictions is not
+    /// counted.
     pub matrices: usize,
     /// Largest jitter that was needed, as a fraction of the signal variance.
     pub largest: f64,

@@ -9,8 +9,8 @@
 //! Data flow:
 //!
 //! 1. [`scale`] checks the [`TrainingRows`] and standardises them.
-//! 2. One of two forms computes the likelihood, its gradient, the coefficients and the predictions. [`exact`] uses all
-//!    pairs of rows; [`nearest`] uses each row with its nearest rows.
+//! 2. One of two forms of the regression computes the likelihood, its gradient, the coefficients and the predictions.
+//!    [`exact`] uses all pairs of rows; [`nearest`] uses each row with its nearest rows.
 //! 3. [`search`] maximises the likelihood.
 //! 4. [`Model`] predicts. It can be saved and loaded.
 //!
@@ -25,8 +25,8 @@
 //!
 //! Deviations from the paper that packwatch follows ("Battery Predictions for Electronic Prognostics"):
 //!
-//! 1. For its 30,723 rows, the paper used a fully independent conditional approximation (inducing points). Here,
-//!    [`Form::Nearest`] is the default for that many rows, because a few hundred inducing points cannot represent a
+//! 1. The paper used a fully independent conditional approximation (inducing points) for its 30,723 rows. Here,
+//!    [`Form::Nearest`] is the default for so many rows, because a few hundred inducing points cannot represent a
 //!    rough function over months.
 //! 2. The variance of a prediction includes the uncertainty of the mean function's coefficients.
 //! 3. The half width of the 95 % interval is not fixed at 1.96 standard deviations. It is calibrated for each predicted

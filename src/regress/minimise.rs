@@ -85,8 +85,8 @@ fn line_search<E>(
             if slope < 0.0 && value <= at.value + 1e-4 * slope {
                 return Ok(Some(Minimum { x, value, gradient, iterations: at.iterations + 1 }));
             }
-            // The next trial is the minimum of the parabola through both points, limited to 10 % to 50 % of the present
-            // step.
+            // A parabola has the value and slope of the current point, and the value of this trial. The next trial is
+            // its minimum, limited to 10 % to 50 % of the present step.
             let bend = 2.0 * (value - at.value - slope);
             step *= if bend > 0.0 { (-slope / bend).clamp(0.1, 0.5) } else { 0.5 };
         } else {

@@ -23,7 +23,8 @@ use super::search::{SearchMonitor, descend, first_start, log_bounds, random_star
 use super::settings::{FitProgress, Form, GprSettings, ProgressCallback, TrainingRows};
 use super::{exact, nearest};
 
-/// Maximum number of rows that the search of [`Form::Nearest`] uses. More rows do not change predictions noticeably.
+/// Maximum number of rows that the search for hyperparameters uses with [`Form::Nearest`]. More rows do not change
+/// predictions noticeably.
 const SEARCH_ROWS: usize = 6000;
 const MAX_THREADS: usize = 1024;
 const MAX_RESTARTS: usize = 1000;
@@ -91,9 +92,10 @@ pub struct ModelSpec {
 pub struct FitOutcome {
     /// Log marginal likelihood of the standardised targets.
     pub log_likelihood: f64,
-    /// Jitter that the final model needed.
+    /// Jitter (value added to the diagonal of the covariance) that the final model needed.
     pub jitter: Jitter,
-    /// Number of steps of the best search, over all its selections of neighbours.
+    /// Number of steps of the best search. If the search selected neighbours several times, the steps of all rounds are
+    /// added up.
     pub iterations: usize,
 }
 
@@ -224,8 +226,8 @@ impl<'a> FitJob<'a> {
         best.map(|best| (best.x, best.iterations)).ok_or(RegressionError::NotPositiveDefinite { jitter: jitter::LAST })
     }
 
-    /// Runs one search. For [`Form::Nearest`], neighbours are selected again and the search is repeated until the
-    /// length scales do not change the order of distances.
+    /// Runs one search. For [`Form::Nearest`], neighbours are selected again and the search is repeated until the new
+    /// length scales order the distances like the previous ones.
     fn one_search(&self, mut start: Vec<f64>, monitor: &mut SearchMonitor) -> Result<Option<Minimum>, RegressionError> {
         let (low, high) = log_bounds(&self.plan, self.spread);
         let mut found: Option<Minimum> = None;
@@ -311,8 +313,8 @@ impl<'a> FitJob<'a> {
     }
 }
 
-/// Returns at most `most` row numbers, evenly spaced in `0..n`. For [`Form::Nearest`], they are a random sample,
-/// because its rows are in random order.
+/// Returns at most `most` row numbers, evenly spaced in `0..n`. For [`Form::Nearest`], the rows are in random order, so
+/// the result is a random sample.
 fn evenly_spaced(n: usize, most: usize) -> Vec<u32> {
     let count = n.min(most);
     (0..count).map(|k| u32::try_from(k * n / count).unwrap_or(u32::MAX)).collect()

@@ -43,8 +43,8 @@ struct Body {
     beta: Vec<f64>,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     beta_covariance: Vec<f64>,
-    /// Rows that were left out to calibrate the intervals. `ratios` has one entry per row: |residual| / predicted
-    /// standard deviation.
+    /// Indices of the rows that were left out to calibrate the intervals. For each of these rows, `ratios` has
+    /// |residual| / predicted standard deviation.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     left_out: Vec<u32>,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]

@@ -79,7 +79,7 @@ impl StandardisedRows {
 }
 
 impl Scale {
-    /// Computes the scale of checked rows. With the zero basis, the target is not shifted.
+    /// Computes the scale of checked rows. With [`Basis::Zero`], the mean of the targets is not subtracted.
     pub(super) fn of(rows: &TrainingRows, standardise: bool, basis: Basis) -> Self {
         let column = |d: usize| rows.inputs.iter().skip(d).step_by(rows.dimensions).copied();
         let inputs: Vec<(f64, f64)> =

@@ -1,7 +1,7 @@
 //! Finds hyperparameters with maximum marginal likelihood: starts, bounds, and the search from each start.
 //!
-//! Input: a plan and an objective, which is a function of the logarithms of the plan's parameters. Output: the best
-//! point, or `None` if the objective has no value at the start.
+//! Input: a plan (the list of hyperparameters) and an objective, which is a function of the logarithms of these
+//! parameters. Output: the best point, or `None` if the objective has no value at the start.
 
 use std::ops::ControlFlow;
 

@@ -35,8 +35,8 @@ pub struct TrainingRows<'a> {
 pub enum Form {
     /// Uses all pairs of rows, without approximation.
     Exact,
-    /// Vecchia's approximation. The rows are put in a seeded random order, in which the density of a row depends only
-    /// on its nearest predecessors. A prediction depends only on the nearest training rows.
+    /// Vecchia's approximation. The rows are put in a random order. The density of a row then depends only on the
+    /// nearest of the rows before it. A prediction depends only on the nearest training rows.
     Nearest {
         /// Number of neighbours, 1 to 500.
         neighbours: usize,
@@ -121,7 +121,7 @@ pub struct FitProgress {
     pub iteration: usize,
     /// Maximum number of steps of a search.
     pub max_iterations: usize,
-    /// Best log marginal likelihood of this search per row, for standardised targets.
+    /// Best log marginal likelihood of this search, divided by the number of rows; for standardised targets.
     pub log_likelihood_per_row: f64,
 }
 

@@ -1,4 +1,5 @@
-//! Compares the exact form with the nearest-neighbour form and gradients with finite differences, and tests whole fits.
+//! Compares the exact form of the regression with its nearest-neighbour form, compares gradients with finite
+//! differences, and tests whole fits.
 
 use std::ops::ControlFlow;
 
@@ -16,8 +17,8 @@ fn noise(seed: u64) -> impl FnMut() -> f64 {
     }
 }
 
-/// Returns inputs and targets of rows: 3, plus a sine of the first input, plus half the product of both inputs, plus
-/// noise.
+/// Returns the inputs and the targets of `rows` rows. A target is 3, plus a sine of the first input, plus half the
+/// product of both inputs, plus noise.
 fn wavy_plane(rows: usize, seed: u64) -> (Vec<f64>, Vec<f64>) {
     let mut draw = noise(seed);
     let inputs: Vec<f64> = (0..2 * rows).map(|_| 2.0 * draw()).collect();

@@ -6,7 +6,7 @@ use std::fs::File;
 use std::io::Read as _;
 use std::path::{Path, PathBuf};
 
-/// Folder of the unit's credentials (`LoadCredential=`).
+/// Environment variable with the folder of the systemd unit's credentials (`LoadCredential=`).
 const CREDENTIALS: &str = "CREDENTIALS_DIRECTORY";
 /// Largest file, bytes. A file with the certificates of all public authorities is several times smaller.
 const MAX_BYTES: u64 = 1 << 20;

@@ -1,5 +1,5 @@
 //! Sends the daemon's status to other software inside or outside the vehicle: MQTT brokers (`mqtt`) and KUKSA
-//! databrokers (`kuksa`). Testers read it as a component of SOVD (`sovd`).
+//! databrokers (`kuksa`). Diagnostic testers can read the status over SOVD (`sovd`).
 //!
 //! This crate is a separate program, which reads the daemon's status stream like the exporter. A slow, missing or
 //! hostile broker can therefore not delay the estimates, and the daemon needs no network library.

@@ -226,7 +226,8 @@ fn run_all(cases: &[(Row, Case)], configs: &[MonitorConfig], options: &Options) 
     scores.into_inner().unwrap_or_default()
 }
 
-/// Prints the unexpected findings: those of another kind than the fault's, and all findings before the fault began.
+/// Prints the unexpected findings: findings of another kind than the simulated fault, and all findings before the fault
+/// began.
 fn list((f, q, balancing): Row, case: &Case, seen: &[FirstFinding]) {
     let (from_s, kind) =
         case.fault().map_or((f64::INFINITY, None), |fault| (fault.from_s, finding::kind_of(&fault.kind)));

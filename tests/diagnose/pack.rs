@@ -21,7 +21,7 @@ const SLEEP_GAP_S: f64 = 30.0;
 const LOOK_S: f64 = 300.0;
 /// A discharge current above this value counts as driving (current divided by capacity, 1/h).
 const DRIVE_PER_H: f64 = 0.05;
-/// If the pack has not been driving for longer than this (s), the next driving current begins a new drive.
+/// If the vehicle has not been driving for longer than this (s), the next driving current begins a new drive.
 const PARKED_S: f64 = 1800.0;
 /// Cells per temperature sensor.
 pub(crate) const CELLS_PER_SENSOR: u16 = 4;
@@ -79,7 +79,8 @@ pub(crate) struct FirstFinding {
     pub(crate) found: CellFault,
 }
 
-/// Writes a pack's configuration to `folder` and loads it. It contains the bits with which the BMS reports bled cells.
+/// Writes a pack's configuration to `folder` and loads it. The configuration contains the bits in which the BMS reports
+/// the cells that it bleeds (discharges to balance the pack).
 pub(crate) fn configuration(folder: &Path, size: PackSize) -> Result<MonitorConfig, String> {
     let sensors = size.cells.div_ceil(CELLS_PER_SENSOR);
     let write = |name: &str, text: String| std::fs::write(folder.join(name), text).map_err(|e| e.to_string());
@@ -207,8 +208,8 @@ impl Case {
         }
     }
 
-    /// Returns the findings in the order of their first occurrence. A finding that correctly describes a sensor's own
-    /// error is omitted, unless its kind is expected.
+    /// Returns the findings in the order of their first occurrence. The simulated sensors have errors of their own. A
+    /// finding that correctly describes such an error is omitted, unless the simulated fault is of the same kind.
     pub(crate) fn run(&self, config: &MonitorConfig) -> Vec<FirstFinding> {
         let mut sim = self.simulation(config);
         let encoder = InputEncoder::new(&config.input);

@@ -153,8 +153,9 @@ fn wander(t: f64) -> f64 {
     (0.6 * (t / 160.0).sin() + 0.4 * (t / 1340.0).sin()).clamp(-1.0, 1.0)
 }
 
-/// A day with a noisy temperature sensor (standard deviation 0.7 C). The cell is at about 40 C at both ends of the day.
-/// From one hour after the start to one hour before the end, it stays within 1 C of 50 C.
+/// A day with a noisy temperature sensor (standard deviation 0.7 C). The true temperature of the cell is about 40 C at
+/// both ends of the day. From one hour after the start to one hour before the end, the true temperature stays within
+/// 1 C of the threshold of 50 C.
 fn temperature_day(alarm: &str) -> Day {
     let mut noise = Noise::new(1);
     day(configuration(alarm), Rule::TemperatureHigh, |_, t| {

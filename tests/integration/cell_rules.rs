@@ -338,7 +338,8 @@ fn with_balancing(change: fn(BalancingConfig) -> BalancingConfig) -> impl Fn(Mon
     move |config| MonitorConfig { balancing: config.balancing.map(change), ..config }
 }
 
-/// Without the balancing bits, only the lowest cell (7) counts as leaking because the BMS may have bled cell 3.
+/// Cells 7 and 3 leak; the leak of cell 7 is larger. Without the balancing bits, only cell 7 is found, because it is
+/// the lowest cell, which a BMS never bleeds. The BMS may have bled cell 3.
 #[test]
 fn balancing_bits_reveal_leaks_of_other_cells() {
     let leak_of = |cell| (CellFaultKind::Leak, Some((CellIndex(cell), CellIndex(cell))));
@@ -399,7 +400,7 @@ fn frozen_current_is_found_once() {
     assert_eq!(pack.events.iter().filter(is_it).count(), 1);
 }
 
-/// If the offsets are several kelvins, the median of three readings may be the reading of the detached sensor.
+/// If the offsets of the sensors are several kelvins, the median of three readings may come from the detached sensor.
 #[test]
 fn detached_temperature_sensor_is_found_despite_offsets() {
     let mut settings = settings();

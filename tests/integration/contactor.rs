@@ -64,7 +64,7 @@ fn stale_contactor_state_uses_measured_current() {
     rig.seconds(3);
     assert_eq!(current_a(&rig), Some(1.0));
     assert!(rig.monitor.lost_inputs().eq([Channel::Contactor]));
-    // If no contactor reading has been valid yet, the measured current applies.
+    // While no valid contactor state has been received, the measured current is used.
     let mut silent = Rig::new(CONTACTOR);
     silent.current_a = Some(1.0);
     silent.seconds(10);
@@ -88,6 +88,6 @@ fn restart_with_open_contactors_is_deterministic() {
     };
     let (first, restarted) = (run(false), run(true));
     assert_eq!(first, run(false));
-    // Even a restart of 0 s counts as a downtime, so the estimate may change within its tolerance.
+    // Even a restart that takes 0 s counts as a downtime, so the SOC may change by up to 0.001.
     assert!((first.2 - restarted.2).abs() < 1e-3 && first.3 == restarted.3, "{} {}", first.2, restarted.2);
 }

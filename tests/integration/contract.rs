@@ -31,7 +31,8 @@ const LOSS: f64 = 0.1;
 const RESTARTS: u32 = 10;
 /// Interval between two comparisons of the alarm tables, ms.
 const STEP_MS: i64 = 100;
-/// Maximum wait for two cycles without an alarm change, ms. The share of bad readings changes for up to a minute.
+/// Maximum wait for two cycles without an alarm change, ms. After the last action, the share of bad readings still
+/// changes for up to a minute and may change an alarm.
 const MAX_WAIT_MS: i64 = 600_000;
 const BUS: BusIndex = BusIndex(0);
 

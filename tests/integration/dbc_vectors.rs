@@ -25,8 +25,8 @@ fn is_present(message: &Message, signal: usize, payload: &[u8]) -> bool {
     })
 }
 
-/// Random payloads: `PAYLOADS` for each page of the message, with the page's multiplexor values written. Each other
-/// multiplexor gets a value that some signal uses because cantools rejects a payload with any other value.
+/// Random payloads: `PAYLOADS` for each page of the message, with the page's multiplexor values written. The remaining
+/// multiplexors also get values that some signal uses, because cantools rejects a payload with any other value.
 fn payloads(message: &Message, random: &mut ChaCha8Rng) -> Vec<Vec<u8>> {
     let all: Vec<&MuxCondition> = message.signals.iter().flat_map(|signal| &signal.conditions).collect();
     let mut pages: Vec<&[MuxCondition]> = Vec::new();
@@ -68,11 +68,12 @@ struct Tally {
     values: usize,
     /// Number of compared values per signal, by full name.
     per_signal: BTreeMap<String, usize>,
-    /// Number of payloads per signal that extends past the end of its message, so that every payload is too short.
+    /// For each signal that extends past the end of its message: number of payloads. All payloads are too short for
+    /// such a signal.
     short: BTreeMap<String, usize>,
 }
 
-/// Compares every signal of every message in every payload, including its presence.
+/// Compares every signal of every message in every payload, and whether the payload contains the signal.
 fn compare(python: &OsString, path: &Path, strict: bool) -> Tally {
     let db = Database::parse_bytes(&std::fs::read(path).unwrap()).unwrap();
     let mut random = ChaCha8Rng::seed_from_u64(1);

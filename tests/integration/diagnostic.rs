@@ -1,4 +1,4 @@
-//! Tests cells that are read by diagnostic requests, on a simulated pack and on the log of a real car.
+//! Tests cell voltages that are read by diagnostic requests, on a simulated pack and on the log of a real car.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -96,8 +96,8 @@ fn leaf_log_gives_values_of_its_answers() {
     assert!(controller["lost"].as_array().unwrap().iter().all(|lost| lost == 0), "{controller}");
 }
 
-/// The current rises during the answer with the cells. The cells' voltages belong to the current at the answer's first
-/// frame.
+/// The current rises while the frames of the answer with the cell voltages arrive. The cell voltages must be combined
+/// with the current at the answer's first frame.
 #[test]
 fn answer_values_are_dated_to_first_frame() {
     let folder = tempfile::tempdir().unwrap();

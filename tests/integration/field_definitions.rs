@@ -1,5 +1,5 @@
-//! Tests `check`, `replay` and `doctor` on definitions from practice: a DBC with a faulty message, a current whose
-//! direction is in another signal, and J1939 messages from an unexpected source address.
+//! Tests `check`, `replay` and `doctor` on cases from practice: a DBC with a faulty message, a current whose direction
+//! is in another signal, and J1939 messages from an unexpected source address.
 
 use std::path::{Path, PathBuf};
 
@@ -84,7 +84,8 @@ fn sign_in_other_signal_gives_signed_current() {
     assert!(by_flag.iter().any(|a| *a < -0.5) && by_flag.iter().any(|a| *a > 0.5));
     assert_eq!(by_flag.len(), by_bit.len());
     let apart = by_flag.iter().zip(&by_bit).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
-    // The current of 20 strings has a resolution of 0.1 A in the log with the flag, and 0.01 A in the other log.
+    // The pack current is the sum over 20 strings. Its resolution is 0.1 A in the log whose direction is a separate
+    // flag, and 0.01 A in the other log.
     assert!(apart < 0.06, "{apart}");
     for of in [flag, bit] {
         let page = of.doctor();

@@ -1,5 +1,5 @@
-//! Tests cell models from a label (`score --chemistry`) and from ordinary drives (`fit --log`), on simulated and
-//! measured cells.
+//! Tests cell models that are built from a label, that is, from chemistry and rated capacity (`score --chemistry`), and
+//! models that are fitted to ordinary drives (`fit --log`), on simulated and measured cells.
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -13,7 +13,7 @@ use crate::support::measured;
 
 /// True capacity of the simulated cell (Ah); its label says 3.
 const TRUE_AH: f64 = 2.7;
-/// Resistances of the simulated cell, relative to the prior of its chemistry.
+/// Resistances of the simulated cell, relative to the typical resistances of its chemistry.
 const RESISTANCE: f64 = 1.4;
 
 fn run(args: &[&str]) -> (Option<i32>, String, String) {
@@ -28,7 +28,8 @@ fn json(args: &[&str]) -> Value {
     serde_json::from_str(&out).unwrap()
 }
 
-/// The true cell. Its open-circuit curve is 15 mV above the label's chemistry in the middle, and its capacity differs.
+/// The true cell. At medium SOC, its open-circuit curve is 15 mV above the typical curve of its chemistry. Its capacity
+/// differs from the label.
 fn true_model() -> CellModel {
     let mut model = Label::usual(Chemistry::NcaGraphite, TRUE_AH).model().unwrap();
     let soc = model.soc.clone();
@@ -38,7 +39,8 @@ fn true_model() -> CellModel {
     model
 }
 
-/// A drive from `soc` to 15 %: repeats 20 s at 2C, 20 s at C/2 and 20 s of rest, with longer rests of 10 min.
+/// Writes a drive from `soc` to 15 %: 20 s at 2C, 20 s at C/2 and 20 s of rest, repeated for 40 min. A rest of 10 min
+/// follows, and then the drive continues.
 fn drive(folder: &Path, name: &str, mut soc: f64, seed: u32) -> PathBuf {
     let model = true_model();
     let mut text = "time_s,current_a,voltage_v,temperature_c,discharged_ah\n".to_owned();

@@ -1,5 +1,5 @@
-//! Tests `fit --log` with bad logs. The model must be at least as good as the label's. The output must name what the
-//! log lacks.
+//! Tests `fit --log` with bad logs. The fitted model must not be worse than the model that packwatch makes from the
+//! cell's label (chemistry and rated capacity). The output must name what the log lacks.
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -9,7 +9,7 @@ use packwatch::cell::circuit::{self, BranchAt};
 use packwatch::cell::{CellModel, Chemistry, Discretisation, Label};
 use serde_json::Value;
 
-/// Capacity of the simulated cell (Ah) and its resistances relative to the chemistry prior.
+/// Capacity of the simulated cell (Ah). `RESISTANCE` is its resistance relative to a typical cell of its chemistry.
 const TRUE_AH: f64 = 50.0;
 const RESISTANCE: f64 = 1.3;
 
@@ -44,7 +44,7 @@ const DRIVE: Drive = Drive {
 };
 
 impl Drive {
-    /// The true cell: its open-circuit curve is 15 mV above the label's chemistry in the middle.
+    /// The true cell. At 50 % SOC, its open-circuit voltage is 15 mV above that of a typical cell of its chemistry.
     fn model(&self) -> CellModel {
         let mut model = Label::usual(self.chemistry, self.capacity_ah).model().unwrap();
         let soc = model.soc.clone();
@@ -120,7 +120,8 @@ fn score(args: &[&str]) -> (f64, f64) {
     (soc["rmse_points"].as_f64().unwrap(), soc["coverage"].as_f64().unwrap())
 }
 
-/// Notes of a fit to `logs`. Checks that the model is at least as good as the label's on another drive.
+/// Returns the notes of a fit to `logs`. Checks on another drive that the SOC error with the fitted model is less than
+/// 0.3 points larger than the error with the model from the label.
 fn notes_of_fit(folder: &Path, logs: &[PathBuf], label: &[&str]) -> Vec<String> {
     let model = folder.join("model.toml");
     let (model, judge) = (model.to_str().unwrap(), log(folder, "judge.csv", &[DRIVE]));

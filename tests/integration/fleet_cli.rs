@@ -1,5 +1,5 @@
-//! Runs `packwatch fleet` as a user does. The output must not depend on the division into parts. A kill or a damaged
-//! log must not lose data.
+//! Runs `packwatch fleet` as a user does. The output must not depend on how the fleet is divided into parts. No data
+//! may be lost if the program is killed or a log is damaged.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -22,7 +22,8 @@ struct Fleet {
 }
 
 impl Fleet {
-    /// Six lives, one of them in three files of a folder, and a log without records.
+    /// Simulates the logs of six vehicles. The log of one vehicle is split into three files in a folder. Adds a seventh
+    /// vehicle whose log has no frames.
     fn new() -> Self {
         let fleet = Self { folder: tempfile::tempdir().unwrap() };
         fs::create_dir_all(fleet.path("logs/six")).unwrap();
@@ -281,7 +282,7 @@ fn prior_of_fleet_is_reproducible_and_configures_vehicle() {
     let models = [2.3, 2.4, 2.5, 2.4].map(|capacity_ah| learned(&nmc, capacity_ah));
     write("none", &[]);
     write("two", &models[..2]);
-    // A vehicle that started from a prior does not count because its model repeats the prior.
+    // The last vehicle started from a prior. It must not count, because its model repeats the prior.
     let repeated = LearnedModel { has_prior: true, ..learned(&nmc, 2.5) };
     write("tables", &[&models[..], &[learned(&nca, 2.8), repeated]].concat());
     for (args, wanted) in [

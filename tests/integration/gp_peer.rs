@@ -20,7 +20,8 @@ struct Oracle {
 }
 
 impl Oracle {
-    /// Starts the Python process. If Python or scikit-learn is missing, prints a note and returns `None`.
+    /// Starts the oracle, a Python process that runs scikit-learn. If Python or scikit-learn is missing, prints a note
+    /// and returns `None`.
     fn start(threads: usize) -> Option<Self> {
         let Some(python) = std::env::var_os("PACKWATCH_PYTHON") else {
             eprintln!("SKIPPED: PACKWATCH_PYTHON is not set to a Python with scikit-learn");
@@ -86,7 +87,8 @@ fn case(oracle: &mut Oracle, rows: usize, folder: &Path) -> Case {
     }
 }
 
-/// Fits packwatch's model with the oracle's hyperparameters: length scale 1.5, signal 1, noise variance 0.01, no mean.
+/// Fits packwatch's model with the oracle's hyperparameters: length scale 1.5, signal 1, noise variance 0.01, mean
+/// function 0.
 fn ours(case: &Case, threads: usize) -> Model {
     let mut settings = GprSettings::new("exponential".parse().unwrap(), case.targets.len());
     (settings.basis, settings.form, settings.threads) = (Basis::Zero, Form::Exact, threads);
@@ -96,7 +98,8 @@ fn ours(case: &Case, threads: usize) -> Model {
     fit(&rows, &settings, &mut |_| ControlFlow::Continue(())).unwrap()
 }
 
-/// Largest differences of means and of standard deviations.
+/// Returns the largest difference between the means of packwatch and scikit-learn, and the largest difference between
+/// their standard deviations.
 fn differences(oracle: &mut Oracle, case: &Case, model: &Model, folder: &Path) -> (f64, f64) {
     oracle.ask("fit");
     oracle.ask("predict");

@@ -43,7 +43,7 @@ fn noise(mut state: u64) -> impl FnMut() -> f64 {
     }
 }
 
-/// Voltage as a function of time, temperature and current, with 20 mV of noise.
+/// Writes a CSV file in which the voltage is a function of time, temperature and current, with 20 mV of noise.
 fn rows(folder: &Path, name: &str, count: u32, seed: u64) -> PathBuf {
     let mut draw = noise(seed);
     let mut text = "time_s,current_a,voltage_v,temperature_c,voltage_mv\n".to_owned();
@@ -215,8 +215,8 @@ fn bad_input_error_names_place_and_range() {
     assert!(steps.contains("windows of 5 lags and"), "{steps}");
 }
 
-/// Writes two series in parts of 400 rows. The voltage is autoregressive, x(t) = 1.6 x(t-1) - 0.64 x(t-2) + e, and
-/// drives the temperature.
+/// Writes a CSV file with a voltage and a temperature, in parts of 400 rows. The voltage is autoregressive,
+/// x(t) = 1.6 x(t-1) - 0.64 x(t-2) + e, and drives the temperature.
 fn process(folder: &Path) {
     let mut draw = noise(11);
     let mut text = "cycle,time_s,voltage_v,temperature_c\n".to_owned();

@@ -1,6 +1,6 @@
 //! Tests a hostile or broken bus: random absurd readings, random configurations, a second sender, frames with
 //! packwatch's own identifiers, and a frozen current. Each fault must be detected in time, and an unphysical number
-//! must never be shown as valid. `PACKWATCH_CONFIGS` sets the number of configurations.
+//! must never be shown as valid. `PACKWATCH_CONFIGS` sets the number of random configurations.
 
 use std::path::Path;
 
@@ -125,7 +125,8 @@ fn hostile_readings_give_no_unphysical_estimate() {
     assert!(valid > 10_000, "too few valid estimates to check: {valid}");
 }
 
-/// Sends ten frames a second of a resting pack. A second sender adds `more` frames of the current per second.
+/// Sends the frames of the pack ten times per second. A second sender adds `more` frames per second, which show the
+/// current `current_a`.
 fn with_second_sender(rig: &mut Rig, seconds: u32, more: u32, current_a: f64) {
     let encoder = InputEncoder::new(&rig.config.input);
     let mut made = Vec::new();

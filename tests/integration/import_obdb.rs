@@ -1,8 +1,8 @@
-//! Tests `packwatch import obdb` on the signal sets of three cars. The core must read every expected value of their
-//! test cases from raw frames through the imported file.
+//! Tests `packwatch import obdb` on the OBDb signal sets of three cars. The test cases of a set contain raw frames and
+//! expected values. With the imported file, the core must decode every expected value from the frames.
 //!
 //! Two differences from the reference decoder are allowed. The reference decoder clamps values that packwatch reports
-//! as out of range. packwatch reads nothing from cases that were recorded with missing characters.
+//! as out of range. If a frame of a case was recorded with missing characters, packwatch reads no value from the case.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -42,8 +42,8 @@ struct ImportedCar {
     signals: Vec<(String, (f64, f64))>,
 }
 
-/// Required inputs, in a separate answer. The imported signals become temperatures because a pack may have the most
-/// inputs of this kind.
+/// Inputs that every configuration needs, in a diagnostic answer of their own. The imported signals are configured as
+/// temperatures, because a pack may have more temperature inputs than inputs of any other kind.
 const OTHER_INPUTS: &str = "[[input.diagnostic]]\nname = \"Other\"\nrequest = 1\nresponse = 2\nservice = 0x22\nidentifier = 1\n\
     signals = [{ name = \"Cell{n}\", numbers = \"1-1024\", bit = 0, length = 8 }, { name = \"Current\", bit = 9000, length = 8 }]\n";
 

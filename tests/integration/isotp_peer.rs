@@ -1,5 +1,6 @@
-//! Compares packwatch's ISO-TP with PyPI `can-isotp` (interpreter `PACKWATCH_PYTHON`). Each must reassemble the other's
-//! segmented messages, packwatch despite loss, delay and interleaved senders.
+//! Compares packwatch's ISO-TP with PyPI `can-isotp` (interpreter `PACKWATCH_PYTHON`). Each must reassemble the
+//! messages that the other has segmented. In the test of packwatch's receiver, several senders interleave, and frames
+//! are lost or delayed: packwatch must deliver exactly the intact messages.
 
 use std::collections::BTreeMap;
 use std::io::Write;

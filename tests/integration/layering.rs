@@ -1,5 +1,5 @@
-//! Checks the code against the map in `src/lib.rs`. No module may name a module that it may not import. The core may
-//! not name a runtime, a clock, a file, a socket or a print.
+//! Checks the code against the map of modules in `src/lib.rs`. No module may name a module that it may not import. The
+//! core may not name a runtime, a clock, a file, a socket or a print macro.
 //!
 //! Comments, documentation and literals are ignored. Paths are resolved from `crate::`, from chains of `super::` that
 //! reach the crate root, and inside braces.

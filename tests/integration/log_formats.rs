@@ -34,7 +34,7 @@ fn estimates(folder: &Path, log: &str) -> String {
     fs::read_to_string(out).unwrap()
 }
 
-/// The drive's frames: time since the start (us), identifier, bytes in hex separated by spaces.
+/// The frames of the example `drive.log`: time since the start (us), identifier, bytes in hex separated by spaces.
 fn frames() -> Vec<(i64, String, String)> {
     let text = fs::read_to_string(example("drive.log")).unwrap();
     let frame = |line: &str| {
@@ -185,7 +185,7 @@ fn look_writes_report_or_asks() {
     }
     let text = stderr(&packwatch(&["look", &table, "--out", &out]).code(1));
     assert!(text.contains("which battery is it?"), "{text}");
-    // An existing configuration replaces the label. The message about an unreadable file must name the file.
+    // If the configuration exists, no label is needed.
     let own = path("table.toml");
     let [first, again] = [&["--label", "nmc:2.6Ah"][..], &[]].map(|label| {
         let output = packwatch(&[&["look", &table, "--out", &out, "--write", &own], label].concat()).success();

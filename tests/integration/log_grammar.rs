@@ -370,7 +370,7 @@ fn journal_reads_back_as_written() {
     assert_eq!(records[3..], inputs);
     assert_eq!((counts.bad_lines, counts.ignored_lines, counts.time_backwards), (0, 1, 1));
 
-    // The rest of the cut line must not be read as a shorter line.
+    // The last line is cut off. It must not be read as a complete but shorter line.
     let (records, counts) = read(&[file(folder.path(), "t", &text[..text.len() - 2])], false, |_| {}).expect("read");
     assert_eq!((records.len(), counts.bad_lines), (inputs.len() + 2, 1));
 }

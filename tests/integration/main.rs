@@ -1,8 +1,8 @@
 //! The integration tests. They form one program, so that they are compiled and linked once. They work with `cargo
 //! nextest run` (one process per test) and with `cargo test` (one process, threads).
 //!
-//! One subject: `cargo test --test integration doctor::`. `tests/allocations.rs` is a separate program because it
-//! replaces the global allocator.
+//! To run the tests of one module: `cargo test --test integration doctor::`. `tests/allocations.rs` is a separate
+//! program because it replaces the global allocator.
 #![allow(
     clippy::unwrap_used,
     clippy::print_stdout,

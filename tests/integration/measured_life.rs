@@ -1,10 +1,10 @@
-//! Replays whole lives of measured cells (NASA PCoE B0005, B0006) and compares the estimated with the published
-//! capacities.
+//! Replays whole lives of measured cells (NASA PCoE B0005, B0006) and compares the estimated capacities with the
+//! published capacities.
 //!
 //! The published capacity is the charge delivered at 2 A down to 2.7 V, so the test compares it with the usable
-//! capacity. This limit applies to both cells, even where the cycler discharged further. Discharges are numbered from
-//! 1. The published capacity first falls below 1.4 Ah at discharge 125 (B0005) and 109 (B0006). That of B0005 never
-//! falls below 1.2 Ah. Each model was fitted only to its cell's first five cycles.
+//! capacity. The limit of 2.7 V applies to both cells, even where the cycler discharged further. Discharges are
+//! numbered from 1. The published capacity first falls below 1.4 Ah at discharge 125 (B0005) and 109 (B0006). The
+//! published capacity of B0005 never falls below 1.2 Ah. Each model was fitted only to its cell's first five cycles.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -90,7 +90,7 @@ struct UsableCapacityReport {
     error_ah: f64,
 }
 
-/// Usable capacities reported after each discharge, from number 11 on.
+/// Usable capacities reported after each discharge, with their errors. The first ten discharges are left out.
 fn usable_errors(events: &[Value], discharges: &[Discharge]) -> Vec<UsableCapacityReport> {
     let mut stated = Vec::new();
     let mut mode = "";
@@ -184,7 +184,8 @@ fn usable_capacity_converges_from_wrong_start() {
     }
 }
 
-/// Seed of the windows, and unit of their length, for each run.
+/// For each run, seed and unit of the windows. A window is a random part of a charge or discharge. The monitor receives
+/// only the rows in the windows.
 const RUNS: [(u64, WindowUnit); 4] =
     [(1, WindowUnit::Duration), (2, WindowUnit::Duration), (3, WindowUnit::Charge), (4, WindowUnit::Charge)];
 
@@ -212,11 +213,12 @@ fn usable_capacity_is_learned_from_windows() {
             assert!(life.mean_absolute_ah < 0.085, "{cell} {by} {seed}: {} Ah", life.mean_absolute_ah);
             (sum_ah, sum_covered) = (sum_ah + life.mean_absolute_ah, sum_covered + life.covered);
         }
-        // The voltage curve has the same error whenever the SOC is the same, so a whole set of windows can be bad. The
-        // mean over the sets therefore has a lower limit.
+        // The error of the voltage curve depends only on the SOC, so all windows of a run can be at unfavourable SOC
+        // values. The mean of all runs must therefore be better than a single run.
         let (mean_ah, covered) = (sum_ah / RUNS.len() as f64, sum_covered / RUNS.len() as f64);
         assert!(mean_ah < 0.065, "{cell}: {mean_ah} Ah");
-        // The interval covers too few true values: it ignores curve errors that differ between the ends of a window.
+        // A 95 % interval should cover 95 % of the true values. This interval covers fewer, because it ignores that the
+        // curve's errors differ between the two ends of a window.
         assert!(covered > 0.4, "{cell}: {covered}");
     }
 }

@@ -1,8 +1,8 @@
 //! Puts common wiring mistakes into correct configurations, one at a time. `packwatch doctor` must name each mistake,
 //! and must find nothing in the correct configurations.
 //!
-//! Two packs are simulated: 4 LFP cells with single voltages, and 96 NMC cells with a total voltage. If the measured
-//! data are present, a boat (16 LFP cells), a Kona (total voltage) and other cars are also tested.
+//! The packs are simulated: 4 LFP cells with one voltage per cell, and 96 NMC cells with only the pack voltage. If the
+//! measured data are present, the logs of a boat (16 LFP cells) and of a Hyundai Kona (pack voltage) are also tested.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -114,7 +114,8 @@ impl Pack {
 }
 
 impl Pack {
-    /// The pack with another log. `change` maps seconds since the start and a line to the new line, or `None`.
+    /// Returns the pack with a changed log. `change` gets the time of each line (seconds since the start) and the line,
+    /// and returns the new line, or `None` to remove the line.
     fn with_lines(&self, name: &str, change: impl Fn(f64, &str) -> Option<String>) -> Self {
         let text = std::fs::read_to_string(&self.log).unwrap();
         let time_s = |line: &str| line[1..18].parse::<f64>().unwrap() - 1.7e9;
@@ -154,7 +155,8 @@ fn simulated(name: &str, config: String) -> Pack {
     Pack { files: BTreeMap::from([("pack.dbc".to_owned(), DBC.to_owned())]), config, log, arguments: &[] }
 }
 
-/// The unchanged line. After a temperature line, also adds the values that the controller reports.
+/// Adds the values that the controller reports to a temperature line: the temperature of its transistors, and a summary
+/// line with SOC, SOH and cycles. Returns any other line unchanged.
 fn reported(line: &str, socs: &[(f64, f64)]) -> String {
     let (stamp, frame) = line.split_once(" can0 ").unwrap();
     let Some(data) = frame.strip_prefix("101#") else { return format!("{line}\n") };
@@ -242,8 +244,9 @@ fn simulated_mistakes_are_named_and_right_packs_silent() {
 /// - whether the chemistry is LFP
 /// - SOC at the start
 /// - duration (s)
-/// - current (A, positive = discharge) at a time (s) and a voltage (V per cell); NaN: the controller sleeps
-/// - reported SOC at a time (s) and a true SOC
+/// - current (A, positive = discharge) as a function of time (s) and voltage (V per cell); NaN: the controller sleeps
+///   and sends nothing
+/// - reported SOC as a function of time (s) and true SOC
 type RightPack = (&'static str, bool, f64, u32, fn(f64, f64) -> f64, fn(f64, f64) -> f64);
 
 const RIGHT: &[RightPack] = &[
@@ -344,7 +347,7 @@ fn right_packs_of_vehicles_are_silent_and_their_faults_named() {
 
 #[test]
 fn hole_in_log_is_named_with_its_times() {
-    // Two hours are missing: either of the whole log, or of the current alone.
+    // Two hours are missing, either in the whole log or only in the current.
     for (is_whole, words) in [(true, "a stretch of 2 h is missing in the log"), (false, "pack current: no reading for")]
     {
         let is_kept =
@@ -373,7 +376,7 @@ fn current_without_sign_or_direction_is_named() {
     }
 }
 
-/// A folder of further measured data, next to the folder of measured data.
+/// Path of a folder in `more-data`: optional data in a second place near the measured data.
 fn more_data(name: &str) -> PathBuf {
     measured::path("can_ev").join("../../more-data").join(name)
 }

@@ -56,7 +56,7 @@ fn empty_cell_and_spread_raise_alarms() {
     rig.seconds(120);
     assert_eq!(rig.changes(Rule::SocLow), [Change::Raised]);
     assert_eq!(rig.changes(Rule::CellImbalance), [Change::Raised]);
-    // Without the full cell, the spread is unknown. The empty cell is still known.
+    // The fuller cell is lost, so the spread is unknown. The SOC of the empty cell is still known.
     rig.voltages_v[0] = None;
     rig.seconds(5);
     assert_eq!(rig.changes(Rule::SocLow), [Change::Raised]);
@@ -113,7 +113,7 @@ fn learned_alarm_is_suppressed_while_inputs_lost() {
     let mut rig = learned();
     let before = rig.last_wire(Rule::CapacityLow);
     assert_eq!((before.state, rig.unknown_rules()), (1, 0));
-    // The current is still received, so the buses are not asleep.
+    // The reported SOC is still received, so the buses are not asleep.
     (rig.current_a, rig.voltages_v, rig.temperatures_c) = (None, [None; 2], [None; 2]);
     rig.seconds(10);
     assert_eq!(rig.changes(Rule::CapacityLow)[2..], [Change::Suppressed, Change::Suppressed]);

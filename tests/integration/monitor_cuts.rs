@@ -1,8 +1,9 @@
 //! Tests that a monitor restored from a snapshot continues with byte-identical frames, events and estimates.
 //!
 //! A pack of three cells runs through random drives, faults, gaps, sleep and backward clock steps. It uses all kinds of
-//! inputs, alarms and commands. One monitor runs without interruption. After random inputs, the other monitor is
-//! replaced by one that is restored from its snapshot (through JSON). Each replacement is a cut.
+//! inputs, alarms and commands. One monitor runs without interruption. A second monitor receives the same inputs. After
+//! random inputs, it is replaced by a monitor that is restored from its snapshot (through JSON). Each replacement is a
+//! cut.
 //!
 //! Two more packs run in the same way: one learns its cell model, the other authenticates its frames. Authenticated
 //! frames are compared without the freshness because it restarts by design.

@@ -17,7 +17,7 @@ fn numbers(value: &Value, path: &str, found: &mut Vec<String>) {
     }
 }
 
-/// Possible damaged values of a number. JSON writes a non-finite number as null.
+/// Values that replace a number to simulate damage. JSON writes a non-finite number as null.
 fn damages(number: &Value) -> [Value; 4] {
     let negative =
         number.as_i64().map_or_else(|| (-number.as_f64().unwrap().abs() - 1e-3).into(), |n| (-n.abs() - 1).into());
@@ -30,7 +30,7 @@ impl Rig {
         self.out.want_estimates = true;
         self.events.clear();
         self.tick_with_frames();
-        // A signal counts as missing only after some seconds. One step of 1 s can therefore replace ten steps of 0.1 s.
+        // A signal counts as missing only after some seconds, so one step of 1 s can replace ten steps of 0.1 s.
         self.deci += 9;
         let finite = self.out.estimates.drain(..).all(|estimate| {
             let e =
@@ -97,7 +97,7 @@ fn rejected_state_names_number_and_range() {
     assert!(matches!(error, RestoreError::Number { cell: Some(1), .. }), "{error:?}");
     let reported = "snapshot is damaged: a variance of a cell's filter (cell 1) = -0.25, must be 1e-150 to 1e20";
     assert_eq!(error.to_string(), reported);
-    // The monitor must not use any part of the state; it starts fresh.
+    // The monitor must not use any part of the state. It must start as if there were no state.
     rig.seconds(5);
     assert!(rig.monitor.latest().flatten().count() == 2);
 }

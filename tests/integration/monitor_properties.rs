@@ -1,6 +1,6 @@
-//! Tests two properties of the whole core: a restored monitor behaves as if it had never stopped, and ticks before
-//! `next_due` may be omitted. The inputs are the cell of `config/paper.toml`, and a pack of 96 cells whose voltages
-//! come in many frames. Outputs are compared bit for bit.
+//! Tests two properties of the whole core. A restored monitor behaves as if it had never stopped. Ticks before the time
+//! that `next_due` returns have no effect, so the caller may omit them. The inputs are the cell of `config/paper.toml`,
+//! and a pack of 96 cells whose voltages come in many frames. Outputs are compared bit for bit.
 
 use std::path::Path;
 
@@ -146,7 +146,8 @@ fn assert_same(found: &[String]) {
     assert!(found.is_empty(), "{} differences\n{}", found.len(), found.join("\n"));
 }
 
-/// Keeps the differences of frames, which also depend on the transmission schedule, or those of the core's results.
+/// If `frames`, returns only the differences of frames, otherwise only the other differences. Frames also depend on the
+/// transmission schedule.
 fn results(found: Vec<String>, frames: bool) -> Vec<String> {
     found.into_iter().filter(|line| line.contains("frames differ") == frames).collect()
 }
@@ -196,8 +197,9 @@ fn restored_pack_frames_match_uninterrupted_run() {
     assert_same(&results(differences(&config, &records, &splits(&records, 4, false), Downtime::AsStamped), true));
 }
 
-/// Compares a whole run with a run whose configuration is `edit`ed between two splits. Returns a line for the first
-/// difference of each kind, except for the event that reports the reload.
+/// Compares a run without reload with a run that reloads its configuration at every split. The reloads alternate
+/// between the configuration changed by `edit` and the original configuration. Returns a line for the first difference
+/// of each kind, except for the event that reports the reload.
 fn reload_differences(
     config: &MonitorConfig,
     records: &[Record],
@@ -305,7 +307,7 @@ fn early_ticks_have_no_effect_on_silent_sensor() {
 
 #[test]
 fn early_ticks_have_no_effect_over_sleep() {
-    // The last tick before the sleep may be omitted, so start the sleep between two due ticks.
+    // The sleep starts between two due ticks, so one of the runs omits the last tick before the sleep.
     let (config, records) = edited(|time_s, record| (!(5000.035..8600.0).contains(&time_s)).then_some(record));
     assert_early_ticks_have_no_effect(&config, &records);
 }

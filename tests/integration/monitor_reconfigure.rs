@@ -88,7 +88,7 @@ fn removed_rule_ends_its_alarm() {
     let wire = rig.last_wire(Rule::TemperatureHigh);
     assert_eq!((wire.state, wire.test), (6, false), "the alarm state is unknown");
     assert!(rig.events.iter().any(|event| event.kind == EventKind::Reconfigured { alarms_ended: 1 }));
-    // The reload must not affect the alarm of the rule's other severity.
+    // The rule now has a severe threshold instead of a warning threshold. The severe alarm must be raised as usual.
     rig.heat(60.0, 1);
     assert_eq!(rig.changes(Rule::TemperatureHigh), [Change::Forgotten, Change::Raised]);
     assert_eq!(rig.state(Rule::TemperatureHigh, None), (AlarmState::Active, 1, false));

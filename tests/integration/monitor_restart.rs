@@ -38,7 +38,8 @@ fn state_from_future_has_unknown_age() {
     rig.seconds(1);
     assert_eq!(rig.gaps(), [None]);
     assert!(rig.soc_std(0) > 0.25, "{}", rig.soc_std(0));
-    // Frames of several interfaces may arrive slightly out of order. The clock was not set back.
+    // The first frame is only about half a second older than the state. This does not count as a clock that was set
+    // back, because frames of several interfaces may arrive slightly out of order.
     let mut rig = learned();
     (rig.current_a, rig.deci) = (None, rig.deci - 5);
     rig.restart(Downtime::AsStamped);
@@ -265,7 +266,7 @@ fn low_soc_is_not_judged_by_old_value() {
             rig.seconds(1);
             let heard = rig.changes(Rule::SocLow);
             assert_eq!((heard[1], heard.last()), (Change::Suppressed, Some(&Change::Cleared)));
-            // After a sleep the filter is more certain than after a downtime, so it corrects the old SOC slightly
+            // After a sleep, the filter trusts the old SOC more than after a downtime, so it corrects this SOC slightly
             // later.
             assert!(!restarted || heard.len() == 3, "{heard:?}");
         }
@@ -425,7 +426,7 @@ fn changed_identity_means_new_pack() {
 
 #[test]
 fn restart_begins_with_used_up_budget_of_alarm_frames() {
-    // Time since the budget of alarm frames was used up (s). If it exceeds 0.2 s, a burst is allowed.
+    // How long ago the budget of alarm frames would have allowed the next frame (s). Above 0.2 s, a burst is allowed.
     let unused_s = |away| {
         let mut rig = Rig::new("");
         rig.seconds(20);
@@ -438,6 +439,6 @@ fn restart_begins_with_used_up_budget_of_alarm_frames() {
     for away in [Downtime::Unknown, Downtime::Seconds(5.0)] {
         assert!(unused_s(away) < 0.001, "{away:?}: {} s", unused_s(away));
     }
-    // Without downtime, the budget is the one before the restart.
+    // Without a downtime, the budget is the same as before the restart.
     assert!(unused_s(Downtime::Seconds(0.0)) > 10.0, "{}", unused_s(Downtime::Seconds(0.0)));
 }

@@ -1,5 +1,5 @@
-//! Regression scenarios of one measured cell. In each, an earlier version published a false value, lost a value, or
-//! flickered.
+//! Regression tests with one simulated cell. In each scenario, an earlier version of packwatch published a wrong value,
+//! lost a value, or changed a state back and forth.
 
 use std::path::Path;
 

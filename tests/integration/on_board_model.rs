@@ -226,7 +226,8 @@ fn restored_state_continues_learning_unchanged() {
     let mut whole = Live::new(&config);
     let (mut twin, mut from): (Option<Live>, usize) = (None, 0);
     for (at, frame) in frames.iter().enumerate() {
-        // Seven times, restore a twin from a stored state and compare it with the uninterrupted monitor.
+        // Seven times, restore a second monitor (the twin) from a stored state, and compare it with the uninterrupted
+        // monitor.
         if at % (frames.len() / 7) == frames.len() / 14 {
             twin = Some(Live::restored(&config, whole.monitor.snapshot()));
             from = whole.said.len();
@@ -358,7 +359,8 @@ fn prior_given_later_replaces_stored_resistance() {
         live.monitor.latest().next().flatten().unwrap()
     });
     assert!((kept.capacity_ah - last.capacity_ah).abs() < 0.05, "{kept:?}");
-    // The stored resistance refers to the label's model, so it is discarded. The prior's capacity is more certain.
+    // The stored resistance refers to the label's model, so it is discarded. The prior's capacity is more certain than
+    // the stored capacity, so it replaces the stored capacity.
     assert!((changed.resistance_ratio - 1.0).abs() < 0.01, "relative to the prior: {changed:?}");
     assert!(changed.resistance_ratio_std > kept.resistance_ratio_std, "{kept:?} {changed:?}");
     assert!((changed.capacity_ah - fleet.mean.capacity.mean).abs() < 0.05, "{changed:?}");

@@ -1,4 +1,5 @@
-//! Replays a measured drive with the model of another cell. The estimate must become untrusted within half an hour.
+//! Replays a measured drive with the model of another cell. Within half an hour, packwatch must notice that the model
+//! does not fit: the estimate must become untrusted.
 //!
 //! Panasonic 18650PF and LG HG2 are both 18650 cells of nearly 3 Ah. Each drive runs with both models.
 

@@ -1,7 +1,8 @@
 //! Runs `packwatch passport` as a user does. Checks the values against the numbers in the store, the handling of
 //! unknown values, and the formats of both standards.
 //!
-//! Two peers also check the formats. If a peer is missing, its test reports that it was skipped:
+//! Two independent programs ("peers") also check the formats. If a peer is missing, its test reports that it was
+//! skipped:
 //!
 //! - IDTA's template, checked by `aas-submodel-validate`. `PACKWATCH_PYTHON` names a Python that has this package.
 //! - the published JSON schemas. `PACKWATCH_SCHEMAS` names a folder with `ProductConditionBattery-schema.json` (1.0.1)
@@ -14,7 +15,7 @@ use std::process::Output;
 use assert_cmd::Command;
 use serde_json::{Value, json};
 
-/// Strings of the simulated pack. Each string carries half of the pack current.
+/// Number of parallel strings of the simulated pack. Each string carries half of the pack current.
 const STRINGS: f64 = 2.0;
 const RATED_AH: f64 = 2.0;
 
@@ -127,8 +128,8 @@ impl Life {
         let last = text.lines().last().expect("a line").to_owned();
         let (end_s, data) = (&last[1..last.find('.').expect("a stamp")], &last[last.find('#').expect("a frame") + 1..]);
         let end_s: u64 = end_s.parse().expect("a number");
-        // The voltage (bytes 0 to 2) is in 10 uV, the current (bytes 3 to 5) in 0.1 mA. At rest, the drop across 0.1
-        // ohm is missing.
+        // The voltage (bytes 0 to 2) is in 10 uV, the current (bytes 3 to 5) in 0.1 mA. At rest, the drop of the last
+        // current across 0.1 ohm disappears, so it is added to the voltage.
         let number = |at: usize| {
             let byte = |k: usize| i32::from_str_radix(&data[2 * k..2 * k + 2], 16).expect("a byte");
             (byte(at + 2) << 24 | byte(at + 1) << 16 | byte(at) << 8) >> 8
@@ -588,7 +589,8 @@ fn sleep_between_trips_loses_no_charge() {
     life.rest("first.log");
     life.simulate("second.log", "1700040000", &["--cycles", "1"]);
     let text = fs::read_to_string(life.path("pack.toml")).expect("a file");
-    // With the shorter age, the buses already count as asleep while the recorder still counts them as awake.
+    // With the shorter maximum age, the monitor already counts the buses as asleep while the recorder still counts them
+    // as awake.
     for age in ["max_age_s = 60.0", "max_age_s = 5.0"] {
         fs::write(life.path("pack.toml"), text.replace("max_age_s = 60.0", age)).expect("written");
         let args = of_logs(&life, &["first.log", "second.log"]);

@@ -1,5 +1,5 @@
-//! Tests bad frames of protected messages, and floods. Each bad frame must be counted and reported, and must not change
-//! an estimate.
+//! Tests bad frames of messages with end-to-end protection, and floods. Each bad frame must be counted and reported,
+//! and must not change an estimate.
 
 use crate::support::config_texts;
 use packwatch::can::e2e::{Profile, Protection, Status};
@@ -95,7 +95,8 @@ impl Bench {
         self.estimates.clear();
     }
 
-    /// Collects the outputs without waiting for the rest of a round of voltages.
+    /// Processes the waiting samples at once, without waiting until every cell has a new voltage, and collects the
+    /// outputs.
     fn take(&mut self) {
         self.monitor.settle(&mut self.out);
         self.events.append(&mut self.out.events);

@@ -1,4 +1,5 @@
-//! Measures the cost of a restart: compares a run that is killed, or loses power, with an uninterrupted run.
+//! Measures how much a restart changes the estimates: compares a run that is killed, or loses power, with an
+//! uninterrupted run.
 //!
 //! The input is days of the simulated electric car. The state is stored every second, as the daemon does. At random
 //! times a second monitor starts from an older state and misses the frames of the downtime. Then it receives the same
@@ -151,8 +152,8 @@ struct Case {
     live: Live,
     until: Timestamp,
     mode: Mode,
-    /// Per cell: difference and stated standard deviation at the first estimate, and the largest difference until the
-    /// end.
+    /// Per cell, at the first estimate after the restart: SOC difference from the uninterrupted run, and the stated
+    /// standard deviation. `largest` is the largest difference until the end.
     first: Vec<Option<(f64, f64)>>,
     largest: Vec<f64>,
     /// Whether every restored capacity was bit-identical to the stored one.
@@ -212,14 +213,16 @@ fn start_waiting(
     let (up, still): (Vec<_>, Vec<_>) = waiting.drain(..).partition(|(up, ..)| time >= *up);
     *waiting = still;
     for (up, mode, state) in up {
-        // The bus has fallen asleep. Another test covers this case.
+        // The next readings came more than 1 s after the restart, because the bus had fallen asleep. Another test
+        // covers this case.
         if time.since(up) > 1.0 {
             continue;
         }
         let mut live = Live::restored(config, state.snapshot);
         live.give(Record::tick(time));
         active.push(Case {
-            // The downtime may complete a half-cycle. Then the monitor learns from it immediately.
+            // If the downtime completes a half-cycle, the monitor learns a new capacity immediately, so that the
+            // capacities may differ.
             kept_learned: learned(&live.monitor) == state.learned
                 || live.out.events.iter().any(|event| matches!(event.kind, EventKind::Capacity { .. })),
             live,

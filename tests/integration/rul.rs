@@ -87,8 +87,8 @@ impl Shape {
     }
 }
 
-/// A life of random length and depth, with noise, correlated variation, and capacity that recovers after long rests. On
-/// the axis of days, the cell also ages during the rests.
+/// Creates a life of random length in which the cell loses a random share of its capacity. The capacity also has noise
+/// and a correlated variation, and recovers after long rests. If the axis is days, the cell also ages during the rests.
 fn life(shape: Shape, axis: Axis, dice: &mut Dice) -> (History, f64) {
     let (readings, depth) = (dice.between(40.0, 300.0).floor(), dice.between(0.2, 0.4));
     let days_each = if axis == Axis::Cycles { dice.between(0.15, 0.25) } else { dice.between(2.0, 5.0) };
@@ -157,8 +157,8 @@ fn forecast_interval_covers_many_fade_shapes() {
 
 #[test]
 fn on_board_life_is_forecast_from_half_cycles() {
-    // The life of `config/paper.toml`, which fades by 0.05 Ah per cycle of 60 %. Here it ends at 1.3 Ah, after 26
-    // cycles.
+    // The life of `config/paper.toml`, which fades by 0.05 Ah per cycle; each cycle is 60 % of a full cycle. Here it
+    // ends at 1.3 Ah, after 26 cycles.
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/paper.toml");
     let mut config = config::load(&path).unwrap_or_else(|faults| panic!("{}", faults.0.join("\n"))).monitor;
     config.health.end_of_life_ah = 1.3;

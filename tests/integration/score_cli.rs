@@ -1,4 +1,4 @@
-//! Runs `packwatch score` as a user does, on files whose true values are known analytically.
+//! Runs `packwatch score` as a user does, on files whose true values can be calculated by hand.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -89,7 +89,8 @@ fn perfect_cell_converges_from_20_points() {
 
 #[test]
 fn cell_error_appears_in_score() {
-    // The voltages indicate an SOC 8 points above the counted charge, and the estimator trusts them.
+    // The voltages belong to an SOC that is 8 points higher than the SOC from the counted charge. The estimator trusts
+    // the voltages.
     let bench = Bench::new();
     bench.write_discharge("drive.csv", 1.5, 0.08);
     let score = &bench.json(&["drive.csv", "--start", "middle", "--told", "0", "--soc-std", "30"])["scores"][0];

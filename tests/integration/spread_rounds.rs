@@ -1,5 +1,6 @@
-//! Tests the check of the current if a pack's voltages arrive in many frames. It must use complete rounds of voltages,
-//! even if the first cells belong to a module of another kind.
+//! Tests the check that compares the current with the voltages, in a pack whose cell voltages arrive in many frames,
+//! spread over time. The check must wait for complete rounds (one voltage of every cell), even if the first cells
+//! belong to a module with other cells.
 
 use std::fmt::Write as _;
 
@@ -14,7 +15,7 @@ use crate::support::rig::{DBC, PACK};
 const CELLS: u16 = 40;
 const MODULE: &str = "[[pack.module]]\ncells = \"1-20\"\nchemistry = \"nmc-graphite\"\nrated_capacity_ah = 2.6\n";
 
-/// The rig's pack with [`CELLS`] cells: ten messages with four voltages each.
+/// The pack of the test rig, enlarged to [`CELLS`] cells: ten messages with four voltages each.
 fn config(modules: &str) -> MonitorConfig {
     let pack = PACK
         .replace("cells = 2\n", "cells = 40\n")
@@ -35,7 +36,8 @@ fn load_a(second: u32) -> f64 {
     f64::from((second / 10).wrapping_mul(2_654_435_761) >> 24) / 64.0 - 2.0
 }
 
-/// Drives for 10 minutes. Returns in how many seconds a cell was untrusted.
+/// Simulates a drive of 10 minutes. Returns the number of seconds at whose end the estimate of at least one cell was
+/// not trusted.
 fn untrusted_seconds(modules: &str, sign: f64) -> u32 {
     let config = config(modules);
     let ohm = config.model.r0_ohm(&config.model.grid_position(0.5, 25.0));

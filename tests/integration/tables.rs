@@ -1,5 +1,5 @@
-//! Tests tables of cyclers and applications. They must give the same estimates as packwatch's own table, or be rejected
-//! if a unit is wrong.
+//! Tests tables in the formats of cyclers and applications. They must give the same estimates as a table in packwatch's
+//! own format. A table with a wrong unit must be rejected.
 
 mod exports;
 

@@ -72,7 +72,8 @@ struct Pack {
 }
 
 const SHORT_S: u32 = 300;
-/// Resistance (ohm), heat capacity (J/K) and open-circuit voltage (V) of a large cell, and the delay of its sensor (s).
+/// Resistance (ohm), heat capacity (J/K) and open-circuit voltage (V) of a large cell, and the time constant of its
+/// temperature sensor (s).
 const CELL_OHM: f64 = 0.001;
 const CELL_J_PER_K: f64 = 1000.0;
 const OCV_V: f64 = 3.7;
@@ -92,7 +93,8 @@ impl Pack {
 /// The first alarm: time after the short circuit (s), cell, value, and temperature of the cell (degrees C).
 type Alarm = (f64, CellIndex, f64, f64);
 
-/// Runs from `begin_s` until a new alarm, for at most ten minutes after the short circuit.
+/// Passes the frames of a pack with a short circuit to the monitor; the clock starts at `begin_s`. Returns the first
+/// new alarm in the ten minutes after the short circuit.
 fn first_alarm(ohm: f64, begin_s: f64, monitor: &mut Monitor) -> Option<Alarm> {
     let encoder = InputEncoder::new(&config().input);
     let mut pack = Pack { ohm, cell_c: 25.0, sensor_c: 25.0, lost_ah: 0.0 };
@@ -135,8 +137,8 @@ fn first_alarm(ohm: f64, begin_s: f64, monitor: &mut Monitor) -> Option<Alarm> {
 #[test]
 fn short_circuit_raises_alarm_of_its_cell() {
     println!("| short circuit (mohm) | alarm after (s) | evidence | temperature of the cell (degrees C) |");
-    // Short circuit (ohm), latest alarm (s) and evidence. A short circuit of 0.5 ohm discharges 15 % in an hour;
-    // `cell_leak` detects it.
+    // Resistance of the short circuit (ohm), latest time of the alarm (s), and value of the alarm. A short circuit of
+    // 0.5 ohm must raise no thermal event: it discharges 15 % in an hour, and the rule `cell_leak` detects it.
     let wanted = [(0.001, 4.0, 1.0), (0.003, 10.0, 1.0), (0.005, 25.0, 2.0), (0.02, 60.0, 2.0), (0.05, 120.0, 2.0)];
     for (ohm, latest_s, evidence) in wanted {
         let (after_s, cell, value, cell_c) = first_alarm(ohm, 0.0, &mut Monitor::new(config())).expect("an alarm");

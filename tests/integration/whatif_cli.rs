@@ -50,7 +50,8 @@ fn grid_replay_equals_single_replays() {
     let choices = ["--set", "capacity_low.threshold=2.35,2.2", "--set", "capacity_low.probability=0.5,0.9", "--set"];
     let sweep = bench.whatif(&[&choices[..], &["soc_low.warning=0.35", "--end-of-life", "80 %", "a.log.gz"]].concat());
     assert_eq!((sweep["replays_per_log"].as_u64(), sweep["settings"].as_array().unwrap().len()), (Some(1), 5));
-    // Keys outside the alarms require a separate replay for each setting. This key has its default value.
+    // A key outside the alarms requires a separate replay for each of its settings. Here, the key is set to its default
+    // value, so the alarms must stay the same.
     let alone = ["estimator.voltage_noise_v=0.005", "--end-of-life", "80 %", "a.log.gz"];
     let alone = bench.whatif(&[&choices[..], &["soc_low.warning=0.35", "--set"], &alone].concat());
     assert_eq!(alone["replays_per_log"], 2);

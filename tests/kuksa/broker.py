@@ -73,7 +73,7 @@ class StrictBroker:
         self.changed = threading.Condition()
         self.provider: "queue.Queue | None" = None
         self.answers: queue.Queue = queue.Queue()
-        # While a request waits for its answer, databroker 0.7 accepts no values.
+        # Held while a request waits for its answer, because databroker 0.7 accepts no values during this time.
         self.lock = threading.Lock()
         self.pool = concurrent.futures.ThreadPoolExecutor(max_workers=16)
         # A fixed window of 64 KiB limits what a provider can send while the broker does not read.

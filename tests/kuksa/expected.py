@@ -1,5 +1,5 @@
-"""Computes the expected value of each output from the status document, without the program's code, to check signs,
-units and names."""
+"""Computes the value that each output of the KUKSA provider must have, from the status document. Uses none of the
+provider's code, so that signs, units and names are checked independently."""
 
 import struct
 
@@ -158,6 +158,6 @@ CELL_PERCENT = {
 
 
 def outputs(document):
-    """Value of every output by path; None: no value."""
+    """Returns the value of every output by its path; None = no value."""
     names = {STANDARD + name: value for name, value in standard(document).items()}
     return names | {OVERLAY + name: value for name, value in overlay(document).items()}

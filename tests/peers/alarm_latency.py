@@ -3,7 +3,7 @@
 usage: alarm_latency.py alarm FILE COUNT   sends half-cycles to a daemon with the configuration of alarm_latency.test; measures
                                            the time from the frame that ends a half-cycle to the alarm frame
        alarm_latency.py loop FILE COUNT    sends frames 0x123 to a program that answers each with the same data under 0x321
-       alarm_latency.py echo               runs such a program, as the lower bound of the time
+       alarm_latency.py echo               runs such a program; its time is the lower bound
        alarm_latency.py report FOLDER      prints and judges the results; also needs the daemon's files
 
 The times are written to FILE as {"late_ns": [...], ...}. After sending a frame, this program sleeps before it looks for
@@ -26,8 +26,9 @@ RULE, STATE = (16, 5), (21, 3)
 CAPACITY_LOW, ACTIVE, CLEARED = 1, 1, 2
 # The first frame after 10 ms (min_duration_s of the configuration) confirms a new mode.
 MODE_S = 0.012
-# In each half-cycle the current is almost zero except for one pulse. With the configuration's swing, a weak pulse gives a capacity
-# of 0.25 Ah, and a strong pulse 2.1 Ah.
+# In each half-cycle the current is almost zero except for one pulse. The capacity is the charge of the half-cycle
+# divided by the swing (change of SOC) that the configuration states. A weak pulse gives a capacity of 0.25 Ah, and a
+# strong pulse 2.1 Ah.
 IDLE_A, WEAK_A, STRONG_A, PULSE_S = 0.008, 0.35, 3.0, 0.03
 # Ranges of the capacity (charge over swing), Ah. The charge follows from the frames' time stamps. A busy machine
 # lengthens pulses and pauses. If the capacity is then near the alarm's thresholds, or impossible for a cell of 2.6 Ah,

@@ -1,11 +1,12 @@
-"""The Python peer of the whole replay: python-can reads, cantools decodes, and filterpy's UKF steps each cell at each voltage.
+"""Replays a log with Python libraries, for comparison with `packwatch replay`. python-can reads the frames, cantools
+decodes them, and filterpy's UKF makes one step of a cell for each of its voltage readings.
 
 replay.py LOG CONFIG SOCS      prints: frames steps seconds; writes the SOC after each step to SOCS, one number per line
 
 The filter is that of src/core/cell/estimator.rs: states [SOC, U1, ln rho, C], with the same tables, circuit, process
-and measurement noises (defaults of docs/src/reference/keys.md). filterpy's own class gives the sigma points, and they
-are redrawn before the update. The peer omits the gate, the consistency check, learning at transitions, alarms and sent
-frames.
+and measurement noises (defaults of docs/src/reference/keys.md). filterpy's own class draws the sigma points, once
+before the prediction and again before the update. These parts of packwatch are omitted: the gate (rejection of
+implausible voltages), the consistency check, learning at the end of charges and discharges, alarms and sent frames.
 """
 import bisect
 import math

@@ -1,4 +1,5 @@
-"""Shared by run, scaling and profile: paths, the peers' Python, tables, and the results in tests/speed.md."""
+"""Helpers for run, scaling and profile, which compare packwatch with other programs (its peers): paths, the Python that
+the peers need, tables, and the results in tests/speed.md."""
 import os
 import re
 import subprocess
@@ -23,8 +24,8 @@ def install():
 
 
 def python(*modules):
-    """Returns the first interpreter that has the modules (from `--install`, PACKWATCH_PYTHON, or the running one), or
-    None."""
+    """Returns a Python interpreter that has the modules, or None. Tries the one from `--install` first, then
+    PACKWATCH_PYTHON or, without this variable, the running one."""
     for interpreter in (VENV / "bin/python3", os.environ.get("PACKWATCH_PYTHON", sys.executable)):
         command = [str(interpreter), "-c", "import " + ", ".join(modules)]
         try:
@@ -48,7 +49,7 @@ def simulate(log, *options, binary=BINARY, config=CONFIG):
 
 
 def machine():
-    """The machine, its compiler and its load."""
+    """Describes the machine, its compiler, the commit and the load of the machine."""
     info = Path("/proc/cpuinfo").read_text()
     name = re.search(r"model name\s*: (.*)", info)
     rustc = output("rustc", "--version", cwd=REPOSITORY).split()[1]

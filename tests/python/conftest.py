@@ -1,4 +1,4 @@
-"""Shared by the tests: the program, its configurations, a simulated record, and measured data if available.
+"""What the tests share: the program, its configurations, a simulated record, and measured data if available.
 
 PACKWATCH_BIN: the program, default target/debug/packwatch. PACKWATCH_DATA: measured data. Without it, some tests are
 skipped.
@@ -70,8 +70,8 @@ class Interrupt(Exception):
 
 
 def interrupted(call: Callable[[], object], after_s: float = 0.3) -> float:
-    """Calls `call` and interrupts it with a signal whose handler raises. Returns the seconds from the signal to the end
-    of the call."""
+    """Calls `call` and interrupts it with a signal whose handler raises an exception. Returns the seconds from the signal
+    to the end of the call."""
 
     def handle(*_):
         raise Interrupt

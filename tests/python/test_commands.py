@@ -32,7 +32,8 @@ def test_every_score_case_has_a_plot(record, tmp_path):
 
 
 def assert_last_argument_counts(file, given, options, **known):
-    """The call must equal the command with these options. Without the last argument, its result must differ."""
+    """The result of the call must equal the result of the command. Without its last argument, the call must give
+    another result."""
     files = [word for option, path in known.items() for word in (f"--{option}", path)]
     score = pw.score(file, **known, **given)
     assert score.json() == packwatch("score", file, *files, *options.split(), "--json")

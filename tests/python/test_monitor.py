@@ -1,5 +1,5 @@
-"""Tests that a Monitor produces the results of a replay from rows or frames, and that bad input raises a named
-fault."""
+"""Tests that a Monitor, given rows or frames, produces the same results as a replay, and that bad input raises an error
+that names the fault."""
 
 import os
 import re

@@ -1,10 +1,10 @@
 """Decodes frames with cantools, and reads bit positions directly from a DBC.
 
-usage: dbc_oracle.py FILE.dbc decode [strict]   reads `message hex` lines, answers with one line each of
+usage: dbc_oracle.py FILE.dbc decode [strict]   reads lines `message hex`; answers each line with a line of
                                                 `signal=repr(value)` pairs, or `!reason` if cantools rejects the payload;
                                                 omits signals that extend past their message
        dbc_oracle.py FILE.dbc short             answers `message.signal` for each signal that extends past its
-                                                message, found bit by bit from the file's text, without cantools
+                                                message; counts the bits in the file's text, without cantools
        dbc_oracle.py FILE.dbc count             answers `messages signals`, as cantools counts them
        dbc_oracle.py FILE.dbc encode [strict]   reads `message signal=value ...` lines, where a value is a number or a
                                                 word of the value table; answers the payload in hex
@@ -15,7 +15,7 @@ import sys
 
 
 def last_byte(start, length, big_endian):
-    """Returns the highest byte that contains one of the signal's bits, counted from its start bit."""
+    """Returns the number of the highest byte that contains a bit of the signal, by walking from its start bit."""
     bit, highest = start, start // 8
     for _ in range(length - 1):
         if not big_endian:
@@ -29,7 +29,7 @@ def last_byte(start, length, big_endian):
 
 
 def reaches_past(path):
-    """(message, its bytes, signal, bytes needed) for each signal that needs more bytes than its message has."""
+    """Yields (message, bytes in the message, signal, bytes needed) for each signal that extends past its message."""
     message = None
     with open(path, encoding="latin-1") as text:
         for line in text:

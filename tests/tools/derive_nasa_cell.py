@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
 """Makes a cell model of a NASA PCoE 18650 from its first cycles: derive_nasa_cell.py CELL.csv.gz OUT.toml [--name NAME]
 
-Reads only cycles 0..LAST (five discharges, five charges); the model does not use the rest of the life.
+Reads only cycles 0 to LAST_CYCLE (a partial charge, five discharges, five charges). The model does not use the rest of
+the life.
 With one RC branch of fixed time constant, the voltage is linear in the table values:
 
     V(t) = sum_j OCV_j h_j(s) - sum_j R0_j h_j(s) I - sum_j R1_j u_j(t),   tau du_j/dt = h_j(s) I - u_j
 
-Here s is the SOC, h_j the hat function of point j of its grid, I the current (positive = discharge) and u_j the current
 Here s is the SOC, h_j the hat function of point j of its grid, I the current (positive = discharge) and u_j the current
 of the branch at point j. One bounded least-squares problem therefore gives all tables. Between two anchors, the SOC is
 counted in ampere-hours. The anchors are the end of every full charge (SOC 1) and the knee of each discharge (3.0 V
@@ -51,7 +51,7 @@ def ampere_hours(t, i):
 
 
 def with_soc(cycles):
-    """SOC of every sample. The first charge is partial and begins at an unknown SOC, so it only gives a full cell."""
+    """SOC of every sample. The first charge begins at an unknown SOC, so it is left out: it only fills the cell."""
     def knee(t, i, v):
         n = np.flatnonzero((v <= KNEE_V) & (i > 1))[0]
         q = ampere_hours(t, i)

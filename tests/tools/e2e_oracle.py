@@ -8,8 +8,9 @@ usage: e2e_oracle.py   reads lines `profile data_id raw ours flipped` with paylo
                          peer      `raw` as the peer protects it
                          ours?     1 if the peer accepts `ours`, otherwise 0
                          flipped?  1 if the peer accepts `flipped`, otherwise 0
-                       autosar-e2e gives the first three words; it advances the counter itself. cantools gives the other words, only
-                       in profile 5 and from 4 bytes on. cantools does not advance the counter, so its `raw` gets packwatch's counter.
+                       The first three words come from autosar-e2e, which advances the counter itself. The words in
+                       brackets come from cantools, only for profile 5 and payloads of at least 4 bytes. cantools does
+                       not advance the counter, so its `raw` contains packwatch's counter.
 """
 import sys
 

@@ -82,7 +82,7 @@ class Life:
         self.normalised = None
         self.life = dict.fromkeys(("RemainingCycles", "RemainingCyclesLow", "RemainingDays"))
         self.losses = {}  # by cell: signals of its loss modes
-        self.moved = set()  # cells without a new row since the last mode change, which changed their state
+        self.moved = set()  # cells that the last mode change has changed and that have had no new row since
 
     def take_estimate(self, row):
         cell = int(row["cell"])

@@ -4,7 +4,7 @@ docs/src/ecu/contract.md.
     listener = ContractListener("out.dbc", loss=0.1, seed=1)
     listener.handle(time_s, frame_id, data)     call this for each frame of the bus; ignores a random part (`loss`) of them
     listener.table(now_s)                       {(rule, severity, cell): (state, acknowledged)}
-    listener.is_confirmed(now_s)                the digest agrees with the table
+    listener.is_confirmed(now_s)                whether the table agrees with the digest (count and checksum of alarms)
 """
 
 import binascii

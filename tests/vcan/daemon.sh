@@ -8,7 +8,7 @@ config=$tmp/config
 cp -r "$(dirname "${BASH_SOURCE[0]}")/../../config" "$config"
 
 # daemon NAME CONFIG ARGS...: runs without control socket, status socket and state folder unless ARGS name them. An
-# installed packwatch may use the default ones.
+# installed packwatch may use the default sockets and the default folder.
 daemon() {
     local name=$1 file=$2 base=$tmp/$1
     shift 2
@@ -49,10 +49,10 @@ replayed() {
     done
 }
 
-# restart_bar LOG...: prints the allowed SOC difference, in points, between a restarted daemon and a daemon that kept
-# running. If all restarts took at most 2.5 s, 0.2 points are allowed. Otherwise, the largest SOC change during the
-# longest restart is allowed: 6.2 A of 2.6 Ah are 0.066 points a second. A tenth of this and 0.02 points are added for
-# the time between the last sample and the state's time stamp.
+# restart_bar LOG...: prints the allowed difference between the SOC of a restarted daemon and the SOC of a daemon that
+# kept running, in percentage points. If all restarts took at most 2.5 s, 0.2 points are allowed. Otherwise, the largest
+# SOC change during the longest restart is allowed: a current of 6.2 A changes the SOC of a 2.6 Ah cell by 0.066 points
+# a second. A tenth of this and 0.02 points are added for the time between the last sample and the state's time stamp.
 restart_bar() {
     cat -- "$@" | sed -nE 's/.*state (taken up|restored).* away=([0-9.]+).*/\2/p' |
         awk '$1 > away { away = $1 } END { print (away > 2.5 ? 0.073 * away + 0.02 : 0.2) }'

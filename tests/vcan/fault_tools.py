@@ -9,7 +9,7 @@
     fault_tools.py alarm DUMP RULE                         prints the state of the rule's last alarm frame
     fault_tools.py same BEFORE AFTER                       fails unless two snapshots have the same learned values
     fault_tools.py apart DUMP ID OTHER POINTS INTERFACE    fails if the status frames of two daemons differ by more than POINTS of SOC
-    fault_tools.py covers FOLDER DUMP [--after SAMPLE]     compares estimates on the bus with the truth, both from fast_pack's FOLDER
+    fault_tools.py covers FOLDER DUMP [--after SAMPLE]     compares the estimates in DUMP with the true SOC, which fast_pack wrote to FOLDER
 """
 
 import argparse
@@ -87,8 +87,8 @@ class Truth:
                 self.samples[-1].append(float(words[column]))
 
     def errors(self, lines, after: int = -1) -> list[tuple[float, float]]:
-        """Error and stated deviation of the estimates on the bus, from sample `after` on. Each error is reduced by the
-        largest possible SOC change in the delay of the player, which a busy machine causes."""
+        """Error and stated standard deviation of each estimate on the bus after sample `after`. On a busy machine, the
+        player is late, and the SOC changes in this delay. Each error is reduced by the largest possible change."""
         sample, found = -1, []
         self.latest_s = 0.0
         late_s = collections.deque(maxlen=MEMORY)  # delay of each sample in the last seconds
@@ -182,7 +182,8 @@ def reported_by(files: list[Path]) -> tuple[int, int, int]:
 
 
 def learned(args) -> None:
-    """Reads the reports before the store, so that a value stored in between is an extra row, which is allowed."""
+    """Reads the events first and the store second. If the daemon stores a value between these two steps, the store has
+    an extra row, which is allowed."""
     reported, stored = reported_by(args.events), Store(args.state).counts()
     print(" ".join(map(str, stored)))
     if any(of_store < of_events for of_store, of_events in zip(stored, reported)):
@@ -207,7 +208,8 @@ def learned_of(snapshot: dict) -> tuple[list, list]:
 
 
 def comes_back(before: dict, after: dict) -> bool:
-    """Whether the later state contains all learned values. Without input, other alarms may have been raised since."""
+    """Whether the later state contains all learned values and raised alarms. It may contain further alarms, because a
+    daemon without input raises alarms."""
     (capacities, alarms), (later_capacities, later_alarms) = learned_of(before), learned_of(after)
     near = all(abs(now - then) < 1e-6 for then, now in zip(capacities, later_capacities, strict=True))
     return near and all(alarm in later_alarms for alarm in alarms)

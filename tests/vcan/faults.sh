@@ -1,9 +1,9 @@
-# shellcheck shell=bash
-# Helpers for tests of faults:   . "$(dirname "$0")/lib.sh"; . "$(dirname "$0")/daemon.sh"; . "$(dirname "$0")/faults.sh"
-# A daemon with its state on disk learns from fast_pack (a simulated pack in fast motion) while faults occur. Each test
-# prints one line per fault. At the end, it compares the store with the reports.
+# shellcheck shell=bash Helpers for tests of faults: . "$(dirname "$0")/lib.sh"; . "$(dirname "$0")/daemon.sh"; .
+# "$(dirname "$0")/faults.sh" A daemon with its state on disk learns from fast_pack (a simulated pack in fast motion)
+# while faults occur. Each test prints one line per fault. At the end, it compares the store with the events that the
+# daemon has reported.
 
-# Folder of the state of `main`. A test with its own disk overrides this path.
+# State folder of the daemon `main`. A test with its own disk overrides this path.
 state=$tmp/state
 here=$(dirname "${BASH_SOURCE[0]}")
 fast=$tmp/fast

@@ -83,10 +83,10 @@ stop() {
     wait_exit "$1" 10
 }
 
-# Whether NAME's log has a line that matches the (extended) regular expression:   wait_for 5 "start" logged daemon
-# 'ready'
+# logged NAME REGEX: whether NAME's log has a line that matches the extended regular expression.
 logged() { grep -qE -- "$2" "$tmp/$1.log"; }
-# caught_up NAME: whether candump NAME on vcan0 has received all earlier frames. Sends a frame that no other node uses.
+# caught_up NAME: sends a frame that no other node uses to vcan0. Succeeds if candump NAME has received this frame, and
+# so all earlier frames.
 caught_up() { cansend vcan0 7FF#0123 && logged "$1" '7FF#0123'; }
 
 iface_add() { ip link add dev "$1" mtu 72 type vcan && ip link set dev "$1" up; }

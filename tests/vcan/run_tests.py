@@ -11,10 +11,9 @@ The first lines of a test state its needs:
     # run-tests: 12 s, smoke                       `--smoke` (and `tests/all --quick`) runs only these
 
 Each test with --disk, and each test that boots the kernel itself ("with-vcan: on the host"), also has a separate
-kernel. The other tests share boots: each boot takes the next test from a common queue (in-boot). Every test has its own
-network, processes, mounts and root. If a kernel dies, its current test fails and the next boot continues with the other
-tests. If the host's kernel has vcan, each test runs in its own namespaces without a boot.
-boot.
+kernel. The other tests share boots: in each boot, the script in-boot takes the next test from a common queue. Every test
+has its own network, processes, mounts and root. If a kernel dies, its current test fails and the next boot continues
+with the other tests. If the host's kernel has vcan, each test runs in its own namespaces without a boot.
 
 A test's output is printed in one piece when the test ends. Exit status: 0, or 1 if a test failed.
 """
@@ -86,7 +85,7 @@ CHILDREN: set[subprocess.Popen] = set()
 
 
 def environment() -> dict[str, str]:
-    """Returns a copy of the environment for a child. Otherwise the child's start may fail with "Bad address" while
+    """Returns a copy of the environment for a child. Without a copy, the child's start may fail with "Bad address" while
     another thread of tests/all replaces the environment."""
     return dict(os.environ)
 

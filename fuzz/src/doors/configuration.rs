@@ -1,5 +1,5 @@
-//! Fuzz entry points for configurations and cell models. With an accepted configuration, a monitor must run and accept
-//! its own stored state.
+//! Fuzz entry points for configurations and cell models. If a configuration is accepted, a monitor must run with it and
+//! must be able to restore its own stored state.
 
 use packwatch::config::Config;
 use packwatch::monitor::{Downtime, Monitor, Outputs, Snapshot};

@@ -57,8 +57,8 @@ pub fn cuts(data: &[u8]) {
     let (mut expected, mut found) = (outputs(), outputs());
     let (mut until_cut, mut cuts) = (steps[0], 0);
     for (nth, record) in records.iter().enumerate() {
-        // The break is measured from the monitor's clock, not from the previous stamp. These differ, because the
-        // monitor does not immediately set its clock back if earlier stamps follow a stamp in the far future.
+        // The break is measured from the monitor's clock, not from the previous stamp. The two may differ: after a
+        // stamp in the far future, the monitor does not immediately set its clock back when earlier stamps arrive.
         let is_break = record.time.since(whole.now()).abs() > BREAK_S;
         if until_cut == 0 && cuts < MAX_CUTS && !is_break {
             cuts += 1;

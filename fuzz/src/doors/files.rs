@@ -1,5 +1,5 @@
-//! Fuzz entry points for files that are read in blocks: logs, journals, tables. If possible, the test files are written
-//! to a folder in memory.
+//! Fuzz entry points for files that are read in blocks: logs, journals (recorded inputs of the daemon) and tables. The
+//! test files are written to a folder in memory if the system has one (`/dev/shm`).
 
 use std::path::Path;
 
@@ -51,8 +51,8 @@ fn options(strict: bool) -> LogOptions {
     }
 }
 
-/// Checks that reading records one by one and in batches gives the same records. In strict mode, reading must give a
-/// prefix of these records.
+/// Checks that reading records one by one and in batches gives the same records. A strict reader stops at the first
+/// fault of the file. Up to this fault, it must give the same records.
 fn compare(path: &Path) {
     let one_by_one = |strict: bool| -> (Vec<Record>, bool) {
         let mut log = LogSource::new([path.to_owned()], options(strict));

@@ -3,14 +3,14 @@
 //!
 //! | entry point | input of the program | invariants, in addition to "no panic" |
 //! | --- | --- | --- |
-//! | `core` | inputs of the monitor: frames, ticks, gaps, commands, J1939, diagnostics | only own identifiers are sent; estimates are finite; an unknown value clears no alarm; a second run gives the same outputs |
+//! | `core` | inputs of the monitor: frames, ticks, gaps, commands, J1939, diagnostics | only own identifiers are sent; estimates are finite; an unknown value never clears an alarm; a second run gives the same outputs |
 //! | `cuts` | as for `core`, with snapshots taken and restored in between | the monitor accepts its own state; frames, events and estimates are bit-identical to a run without snapshots |
 //! | `snapshot` | a stored state with damaged numbers | the state is rejected, or the monitor runs on with finite outputs and accepts the state that it then writes |
 //! | `configuration` | TOML with numbers of any size in any key | with an accepted configuration, a monitor runs and accepts its own state |
 //! | `cell_model` | a cell model file | with an accepted model, a monitor runs and accepts its own state |
 //! | `dbc` | a DBC file | a written DBC reads back unchanged |
 //! | `log`, `journal` | candump logs, CSV, journals | reading records one by one and in batches gives the same records |
-//! | `formats` | logs of other tools | reading in small parts gives the same items; nothing follows the end |
+//! | `formats` | logs of other tools | reading in small parts gives the same items; no item follows the end of the log |
 //! | `table` | measured CSV of `fit`, `rul`, `gpr` | all rows have the same number of values |
 //! | `obdb`, `bpx` | files of `import` | a cell model that is written from BPX is accepted |
 //! | `control` | a line on the control socket | a written line reads back unchanged |

@@ -15,7 +15,7 @@ use super::files::folder;
 use super::source::Source;
 use super::world;
 
-/// Fuzz input for a drive with a half-cycle.
+/// Fuzz input for a drive with a half-cycle (a complete charge or discharge).
 const DRIVE: &[u8] = &[7, 0xE8, 3, 6, 31, 6, 31, 7, 0x18, 0xFC, 6, 31, 6, 31, 7, 0xE8, 3, 6, 31];
 
 const FILES: [&str; 3] = ["packwatch.db", "state-a.json.zst", "state-b.json.zst"];

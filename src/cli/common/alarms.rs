@@ -59,7 +59,7 @@ pub(crate) fn grouped(alarms: &[Alarm]) -> Vec<AlarmGroup> {
     groups
 }
 
-/// The alarm with the worst value. An alarm without a value counts as the least bad.
+/// Returns the alarm with the worst value. An alarm without a value is returned only if all alarms have no value.
 fn worst(alarms: &[&Alarm]) -> Alarm {
     let badness = |alarm: &Alarm| match (alarm.value, alarm.rule.spec().direction) {
         (None, _) => f64::NEG_INFINITY,

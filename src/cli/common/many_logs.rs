@@ -73,7 +73,8 @@ impl LogArgs {
 /// Opens logs as one continuous recording. The configuration determines how they are read.
 pub(crate) fn open(input: &InputArgs, config: &Config, logs: &[PathBuf]) -> OpenedLog {
     let mut options = log_options(input, config);
-    // A table of cycles next to a log gives the times of that log only, so it is not used with several logs.
+    // A table of cycles (start time of each cycle) next to a log applies only to this log, so it is not used with
+    // several logs.
     let found = logs.first().filter(|_| options.csv.start_times.is_none() && logs.len() == 1);
     let found = found.and_then(|log| truth::cycles_next_to(log));
     let note = found.as_ref().map(|table| format!("dated by {}", table.display()));

@@ -11,7 +11,7 @@ use crate::quantity::MAX_CELLS;
 /// A name, its value, and its line in the help.
 pub(crate) type NamedValue<T> = (&'static str, T, &'static str);
 
-/// Accepts the name of one of these values.
+/// Returns a parser that accepts the names of these values, and shows the names in the help.
 pub(crate) fn one_of<T: Copy + Send + Sync + 'static>(
     all: &'static [NamedValue<T>],
 ) -> impl TypedValueParser<Value = T> {
@@ -24,7 +24,7 @@ pub(crate) fn finite(text: &str) -> Result<f64, String> {
     within(text, |_| true, "a finite number")
 }
 
-/// Parses a finite number that `is_allowed` accepts. The error says that the number must be `allowed`.
+/// Parses a finite number that `is_allowed` accepts. `allowed` describes the accepted numbers in the error.
 pub(crate) fn within(text: &str, is_allowed: impl Fn(f64) -> bool, allowed: &str) -> Result<f64, String> {
     let value = text.trim().parse::<f64>().ok().filter(|value| value.is_finite() && is_allowed(*value));
     value.ok_or_else(|| format!("must be {allowed}"))
@@ -66,7 +66,7 @@ pub(crate) fn cell_number(text: &str) -> Result<u16, String> {
 /// Longest duration that an option accepts (s): ten years.
 pub(crate) const MAX_SECONDS: f64 = 315_576_000.0;
 
-/// Parses the age of a stored state.
+/// Parses the age of a stored state: seconds, or `unknown`.
 pub(crate) fn away(text: &str) -> Result<Downtime, String> {
     match text {
         "unknown" => Ok(Downtime::Unknown),

@@ -86,9 +86,9 @@ impl Output {
     }
 }
 
-/// Number of a channel in MF4, counted from 1. It is one more than the number in the interface's name (`can1` is
-/// channel 2), so that a reader of the file gives the interface the same name. If any name has no number, the
-/// interfaces are counted instead.
+/// Number of a channel in MF4, counted from 1. It is one more than the number in the interface's name: `can1` is
+/// channel 2. A program that reads the file can therefore give the interface the same name. If any interface name has
+/// no number, the interfaces are numbered in their order.
 fn channel(bus: BusIndex, interfaces: &[String]) -> u8 {
     let numbered = |name: &String| name.strip_prefix("can")?.parse::<u8>().ok()?.checked_add(1);
     let numbers: Option<Vec<u8>> = interfaces.iter().map(numbered).collect();

@@ -50,7 +50,7 @@ fn render(report: &WiringReport, config: &Path, source: &str, width: usize, pain
     page
 }
 
-/// The proposed line or, if only a person can know the value, a description of the value.
+/// The proposed configuration line. If only a person can know the value, the key with a description of the value.
 fn proposal(change: &Change) -> String {
     let line = format!("{} = {}", change.key, change.proposed);
     if toml::from_str::<toml::Table>(&line).is_ok() {

@@ -21,7 +21,8 @@ pub(super) fn fit_bar(fits: usize) -> ProgressBar {
     progress_bar((fits * TICKS) as u64, "{bar:32} {percent} % {msg}, {elapsed}, eta {eta}")
 }
 
-/// Shows one step of a hyperparameter search. `before` is the number of fits that were finished before this kernel.
+/// Shows one step of a hyperparameter search. `before` is the number of fits that were finished before the fits with
+/// this kernel.
 pub(super) fn show_step(bar: &ProgressBar, what: &str, before: usize, p: FitProgress) -> ControlFlow<()> {
     let part = (p.search - 1) * p.max_iterations + p.iteration;
     let whole = (p.searches * p.max_iterations).max(1);
@@ -76,7 +77,7 @@ pub(super) fn score_json(s: &PredictionScore) -> Value {
     })
 }
 
-/// Formats a number with four significant digits if zero to nine decimals allow it.
+/// Formats a number with four significant digits, but at most nine decimals.
 pub(super) fn short(value: f64) -> String {
     let digits = (3.0 - value.abs().max(1e-12).log10().floor()).clamp(0.0, 9.0) as usize;
     format!("{value:.digits$}")
@@ -94,7 +95,8 @@ fn total(validated: &CrossValidation, of: impl Fn(&Fold) -> f64) -> f64 {
     validated.folds.folds.iter().map(of).sum()
 }
 
-/// Total number of matrices with jitter, and the largest jitter, over all folds.
+/// Over all folds: the number of matrices to whose diagonal a small value (jitter) was added so that they could be
+/// factorised, and the largest such value.
 fn jitter(validated: &CrossValidation) -> Jitter {
     validated.folds.folds.iter().fold(Jitter::default(), |all, fold| Jitter {
         matrices: all.matrices + fold.jitter.matrices,

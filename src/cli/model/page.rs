@@ -71,7 +71,7 @@ struct CurveRow {
 #[derive(Debug, Serialize)]
 struct ResistanceRow {
     temperature_c: f64,
-    /// Settled resistance at each SOC of the table.
+    /// Settled resistance (after a long time at constant current) at each SOC of the table.
     settled: Vec<SettledResistance>,
     /// Series resistance at half charge (ohm).
     r0_ohm: f64,
@@ -101,7 +101,7 @@ struct AdviceRow {
 }
 
 impl ModelPage {
-    /// Creates the page of a model with the display name of its source.
+    /// Creates the page of a model. `name` is shown as the model's source.
     pub(super) fn new(name: String, sourced: &SourcedModel) -> Self {
         let SourcedModel { model, source } = sourced;
         let bands = ModelBands::new(model);

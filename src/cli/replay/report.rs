@@ -1,4 +1,4 @@
-//! Output of `replay`: the summary.
+//! Prints the summary of `replay`.
 
 use std::io::{self, Write};
 use std::path::Path;
@@ -99,7 +99,7 @@ pub(super) fn write_table(out: &mut impl Write, summary: &ReplaySummary) -> io::
     Ok(())
 }
 
-/// Describes a protected message and how often it had each status.
+/// Describes a protected message, and how often its end-to-end check gave each status.
 fn statuses(of: &ProtectedSummary) -> String {
     let given = of.counts.iter().filter(|(_, count)| **count > 0);
     let given: Vec<_> = given.map(|(status, count)| format!("{status} {count}")).collect();

@@ -1,4 +1,4 @@
-//! Output files of the simulator: a candump log and the truth as CSV, plain or .gz.
+//! Output files of the simulator: a candump log, and the truth (true state of the cells) as CSV, plain or .gz.
 
 use std::io::{self, Write};
 use std::path::Path;

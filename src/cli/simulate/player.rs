@@ -11,7 +11,7 @@ use packwatch_host::failure::Failure;
 pub(super) struct Player {
     sender: CanSender,
     speed: f64,
-    /// Wall clock and stamp of the first frame.
+    /// Time at which the first frame was sent, and its time stamp.
     started: Option<(Instant, Timestamp)>,
 }
 

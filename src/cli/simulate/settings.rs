@@ -109,7 +109,7 @@ pub(super) struct FaultArgs {
 }
 
 impl FaultArgs {
-    /// Whether the truth needs additional columns.
+    /// Whether the table of the true state needs additional columns.
     pub(super) fn changes_truth(&self) -> bool {
         self.balancing || !self.faults.is_empty()
     }

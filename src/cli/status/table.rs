@@ -13,7 +13,7 @@ use crate::status::document::{Intruder, IntruderKind, StatusDocument};
 
 /// Maximum number of cells that are listed without `--cells`, so that the table fits a screen.
 const MAX_LISTED: usize = 16;
-/// A cell can be an outlier only if its distance from the median exceeds this many times the median distance.
+/// A cell can be an outlier only if its distance from the median exceeds this many times the median of all distances.
 const OUTLYING: f64 = 3.0;
 const MAX_OUTLIERS: usize = 8;
 const MOST_FOUND: usize = 8;

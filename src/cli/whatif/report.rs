@@ -164,7 +164,7 @@ impl WhatifReport<'_> {
         })
     }
 
-    /// Rows of a log whose rule is shown.
+    /// Rows of a log, without the rules that are not shown.
     pub(super) fn rows<'l>(&'l self, log: &'l LogResult) -> impl Iterator<Item = &'l ThresholdScore> {
         log.alarms.iter().filter(|row| self.rules.contains(&row.rule))
     }

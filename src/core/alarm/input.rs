@@ -36,16 +36,17 @@ pub enum AlarmInput {
     /// A period without values: input of [`AlarmEngine::handle_gap`].
     Gap,
     Acknowledge(Selector),
-    /// Clears alarms. A latched alarm ends, and the history of a past alarm is forgotten. A raised alarm that is not
-    /// latched stays and counts as refused. A latched alarm whose value is beyond its threshold again also stays and
-    /// counts as refused. Learned values do not change.
+    /// Clears alarms. A latched alarm (one that stays raised although its value is normal again) ends, and the history
+    /// of a past alarm is forgotten. A raised alarm that is not latched stays and counts as refused. A latched alarm
+    /// also stays and counts as refused if its value is beyond its threshold again. Learned values do not change.
     Clear(Selector),
     /// Another pack is connected: input of [`AlarmEngine::forget_learned`].
     ForgetLearned,
 }
 
 impl AlarmEngine {
-    /// Handles one input at `now`. Returns the outcome of a command; for all other inputs, both numbers are 0.
+    /// Handles one input at `now`. Returns the outcome of a command. For an input that is not a command, both numbers
+    /// of the outcome are 0.
     pub fn apply(&mut self, now: Timestamp, input: &AlarmInput, changes: &mut Vec<AlarmChange>) -> CommandOutcome {
         match *input {
             AlarmInput::Observe { rule, cell, observation } => self.observe(now, rule, cell, &observation, changes),

@@ -10,14 +10,15 @@
 //! healthy   P(truth beyond the clear threshold) <= min(p, c)
 //! ```
 //!
-//! Here, c is 0.05 for a learned value and 0.5 for other values. Only a value at the clear threshold or better
-//! therefore clears an alarm; a growing uncertainty does not. The clear threshold is never on the bad side of the set
-//! threshold, so the second probability is never below the first. A value is therefore never beyond and healthy at the
-//! same time. With p = 0.5, the result is the same as for `when = "mean"`. If the standard deviation is needed but
-//! missing, the result is unknown.
+//! Here, c is 0.05 for a learned value and 0.5 for other values. Because c is at most 0.5, an alarm clears only if the
+//! value is at the clear threshold or better. An uncertainty that grows does not clear it. The clear threshold is never
+//! on the bad side of the set threshold, so the second probability is never below the first. A value is therefore never
+//! beyond and healthy at the same time. With p = 0.5, the result is the same as for `when = "mean"`. If the standard
+//! deviation is needed but missing, the result is unknown.
 //!
-//! A learned value (a capacity, a resistance, a remaining life) does not recover by itself. Therefore c also applies to
-//! `when = "mean"`, so that an estimate that fluctuates around its threshold does not clear its alarm.
+//! A learned value (a capacity, a resistance, a remaining life) does not recover by itself. To clear its alarm, P(truth
+//! beyond the clear threshold) <= c must therefore also hold with `when = "mean"`. An estimate that fluctuates around
+//! its threshold then does not clear its alarm.
 
 use serde::{Deserialize, Serialize};
 
@@ -98,7 +99,8 @@ pub(super) enum LimitCheck {
     Between,
     /// The value counts as healthy (see the module).
     Healthy,
-    /// The value or a needed standard deviation is missing, or the value is a bound and not beyond.
+    /// The value or a needed standard deviation is missing. Or the value is only a bound ([`Observation::is_bound`])
+    /// and is not beyond the set threshold.
     Unknown,
 }
 

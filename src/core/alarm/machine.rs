@@ -11,6 +11,9 @@
 //! | latched | count towards active | stay | stay | hold | mark | release |
 //! | cleared | count towards active | stay | stay | unknown | mark, inactive | forget, inactive |
 //!
+//! The columns are the outcome of a comparison and the two commands. A value is `beyond` the set threshold, `healthy`
+//! (on the good side of the clear threshold), or `between` the two thresholds.
+//!
 //! * The name of a state: enter this state.
 //! * Rest: enter `cleared` if the alarm was raised and not acknowledged, else `inactive`.
 //! * End: enter `latched` for a latching rule, else rest.
@@ -23,9 +26,10 @@
 //!
 //! An alarm is raised while it is active, clearing, suppressed or latched.
 //!
-//! Time counts only between two observations of known values on the same side. The time between a known and an unknown
-//! value does not count. For a learned value, time also counts up to each poll, because the value stays valid. An
-//! unknown value does not reset the count, because otherwise an intermittent input could prevent an alarm forever.
+//! Time counts only between two observations that are both beyond the threshold, or both healthy. The time between a
+//! known and an unknown value does not count. For a learned value, time also counts up to each poll, because the value
+//! stays valid. An unknown value does not reset the count, because otherwise an intermittent input could prevent an
+//! alarm forever.
 //!
 //! An alarm may end, or change to `suppressed`, only [`QUICK_ENDS`] times in short succession and then once per
 //! [`END_PERIOD_S`]. Until this is allowed, the alarm stays raised and no change is published. Cyclic frames still show
@@ -179,8 +183,8 @@ impl Machine {
     }
 
     /// Handles a value. When the inputs of a learned value are lost, the half-cycle in progress ends, and its result
-    /// may still arrive as a new value. This value may raise the alarm. A suppressed alarm stays suppressed, because
-    /// the value would clear the alarm or make it look up to date.
+    /// may still arrive as a new value. This late value may raise the alarm. If the alarm is suppressed, it stays
+    /// suppressed, because the late value would clear the alarm, or would look as if the inputs had returned.
     pub(super) fn observe(&mut self, now: Timestamp, rule: &RuleConfig, observation: &Observation) -> Option<Change> {
         self.observation = *observation;
         if self.is_suspended && self.shown() == AlarmState::Suppressed {

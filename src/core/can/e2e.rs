@@ -16,15 +16,15 @@
 //! table shows the resulting CRC.
 //!
 //! A sender rejects a payload that is shorter than the header. A receiver reports such a payload as a wrong CRC.
-//! Source: AUTOSAR "SWS E2E Library". Two test peers and four open-source receivers implement it in this way; the tests
-//! contain vectors.
+//! Source: AUTOSAR "SWS E2E Library". Two independent implementations that the tests use, and four open-source
+//! receivers, agree with this description. The tests contain test vectors.
 //!
 //! * Deviation 1: profile 5 uses the receiver of profile 1 with the counter modulo 256, so that both profiles have the
 //!   same statuses and counts. In AUTOSAR, the check of profile 5 has no statuses SYNC and INITIAL; a separate state
 //!   machine provides them. Effects: the first frame of profile 5 is INITIAL and not used, although AUTOSAR's check
 //!   alone might return OK. While frames are missing, the allowed step of the counter grows. If the counter jumps too
-//!   far, the sequence continues from the new counter, as in AUTOSAR. Therefore, a restart of the sender costs one
-//!   frame instead of up to 256.
+//!   far, that frame is not used, and the sequence continues from its counter, as in AUTOSAR. A restart of the sender
+//!   therefore costs one frame. Otherwise, it might cost up to 256 frames.
 //! * Deviation 2: the setting for repetitions (`max_no_new_or_repeated_data`) is at most 14 for both profiles, and 14
 //!   means "any number".
 //! * Deviation 3: AUTOSAR calls its check once per period, with or without a frame. Here, it is called once per frame.

@@ -1,18 +1,19 @@
 //! Checks the end-to-end protection of input messages.
 //!
-//! In: frames with their time and interface, in order of arrival, and the time between frames ([`Guards::poll`]). Out:
-//! the [`Status`] of each frame and counts per message. A [`GuardChange`] reports that a message starts to fail its
-//! check or becomes usable again.
+//! In: frames with their time and interface, in order of arrival, and the current time, also while no frame arrives
+//! ([`Guards::poll`]). Out: the [`Status`] of each frame and counts per message. A [`GuardChange`] reports that a
+//! message starts to fail its check or becomes usable again.
 //!
 //! If a message's cycle time is known, each period without a frame counts as one [`Status::NoNewData`]. The first
-//! missing frame is counted after one and a half periods, to allow for jitter. While no more frames are missing than
-//! the check allows, no change is reported, because the next frame will be usable. Otherwise, a sender with jitter
-//! would fill the log.
+//! missing frame is counted after one and a half periods, to allow for jitter. The check tolerates a configured number
+//! of missing frames: after them, the next frame is still usable. Up to this number, no change is reported, so that a
+//! sender with jitter does not fill the log.
 //!
-//! After sleep, a restart of the program or a clock step, missing frames are not the sender's fault. The receivers then
-//! wait for a first frame again ([`Guards::restart`]). A restarted program restores the counts but not the frame
-//! counters. The sender has continued to send, so a stored counter would reject good frames, or accept an old frame by
-//! chance. Only a state that resumes without a gap restores the frame counters ([`Guards::resume`]).
+//! After sleep, a restart of the program or a clock step, missing frames are not the sender's fault. The check of each
+//! message then waits for a first frame again ([`Guards::restart`]). A restarted program restores the counts of
+//! results, but not the frame counter of each message. While the program was stopped, the sender continued to count. A
+//! stored frame counter would therefore reject good frames, or accept an old frame by chance. If no time has passed
+//! since the state was stored, the frame counters are restored too ([`Guards::resume`]).
 
 use serde::{Deserialize, Serialize};
 
@@ -53,7 +54,7 @@ pub struct GuardCounts {
     pub counts: StatusCounts,
 }
 
-/// Progress of one message's check, from which the monitor resumes without a gap.
+/// Progress of one message's check. A monitor that continues without a gap in time resumes from it.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct GuardProgress {
     bus: BusIndex,
@@ -85,7 +86,7 @@ pub struct Guards {
 }
 
 impl Guards {
-    /// Creates guards. Of several entries for one message, the first is used.
+    /// Creates guards. If several entries name the same message, the first is used.
     pub fn new(mut configs: Vec<GuardConfig>) -> Self {
         configs.sort_by_key(|config| (config.bus, config.id));
         configs.dedup_by_key(|config| (config.bus, config.id));
@@ -95,8 +96,8 @@ impl Guards {
         Self { changes: Vec::with_capacity(configs.len() + 1), guards: configs.into_iter().map(guard).collect() }
     }
 
-    /// Inherits the counts of messages that are also in `old`. Also inherits the receivers of unchanged messages,
-    /// because a new receiver would not use its first frame.
+    /// Inherits the counts of messages that are also in `old`. If the configuration of a message is unchanged, also
+    /// inherits the state of its check (the receiver), because a new receiver would not use its first frame.
     #[must_use]
     pub fn inheriting(mut self, old: &Self) -> Self {
         for guard in &mut self.guards {
@@ -199,7 +200,7 @@ impl Guards {
 impl Guard {
     fn count_missed(&mut self, now: Timestamp, changes: &mut Vec<GuardChange>) {
         let Some(period_s) = self.config.cycle_time_s else { return };
-        // When listening starts, the first period begins.
+        // The first period begins when the program starts to listen.
         let missed_at = *self.missed_at.get_or_insert(now.plus_secs(MISSED_AFTER_PERIODS * period_s));
         if now < missed_at {
             return;

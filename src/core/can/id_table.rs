@@ -1,6 +1,6 @@
 //! Finds the index of a message by interface and identifier.
 //!
-//! A look-up needs one load for a standard identifier and a binary search for an extended identifier.
+//! A look-up needs one memory access for a standard identifier, and a binary search for an extended identifier.
 
 use crate::can::CanId;
 use crate::quantity::BusIndex;
@@ -17,7 +17,7 @@ pub(crate) struct IdTable {
 
 #[derive(Debug, Clone, PartialEq)]
 struct BusTable {
-    /// Index by standard identifier. Of the 8 KiB, look-ups touch few cache lines.
+    /// Index by standard identifier. The table has 8 KiB, but look-ups use only a few cache lines of it.
     standard: Box<[u32; STANDARD_IDS]>,
     /// Sorted.
     others: Vec<(CanId, u32)>,

@@ -3,7 +3,8 @@
 //!
 //! In: payloads of one sender's frames with their times. Out: complete messages, and the faults of lost messages.
 //! Supports normal and extended addressing with classic frames. Reassembly also supports CAN FD (length escapes). A
-//! [`Receiver`] only listens, because the tester sends flow control. It stores only the bytes that have arrived.
+//! [`Receiver`] only listens, because the diagnostic tester sends flow control. It stores only the bytes that have
+//! arrived.
 
 use crate::quantity::Timestamp;
 
@@ -30,14 +31,14 @@ pub enum IsoTpFault {
     Overlap,
     /// Flow control refused the message (buffer overflow, reserved state).
     Refused,
-    /// The length is 0, beyond the end of a single frame, or so small that no first frame is needed. Also used for a
-    /// first frame that is not full.
+    /// The length is 0, or exceeds the single frame that states it, or is so small that the message would fit into a
+    /// single frame although a first frame states it. Also used for a first frame that is not full.
     WrongLength,
     /// Longer than [`MAX_MESSAGE`].
     TooLong,
     /// A consecutive frame is shorter than the first frame and does not complete the message.
     ShortFrame,
-    /// A consecutive frame without a message.
+    /// A consecutive frame that no first frame preceded.
     NotBegun,
 }
 
@@ -93,14 +94,14 @@ pub enum Progress {
 /// Reassembles the messages of one sender.
 #[derive(Debug, Clone, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 pub struct Receiver {
-    /// For extended addressing.
+    /// Address byte that begins every payload with extended addressing; `None` = normal addressing.
     extension: Option<u8>,
     message: Vec<u8>,
     /// 0 = no message.
     length: usize,
     /// Next sequence number, 0 to 15.
     next: u8,
-    /// Length of the first frame (RX_DL), without the extension.
+    /// Length of the first frame (RX_DL), without the address byte.
     frame_len: usize,
     latest: Timestamp,
     /// Whether the remaining frames of a lost message are ignored.
@@ -183,7 +184,7 @@ impl Receiver {
 
     fn single(&mut self, data: &[u8]) -> Received {
         let overlap = self.begin();
-        // With more than 8 bytes, the length is in the second byte.
+        // If the frame has more than 8 bytes, the length is in the second byte.
         let (length, body) = match (data[0] & 0xF, data) {
             (0, [_, length, body @ ..]) if body.len() + 2 > self.classic_len() => (usize::from(*length), body),
             (length, [_, body @ ..]) => (usize::from(length), body),
@@ -244,7 +245,7 @@ impl Receiver {
         Received { fault: None, progress: Progress::Complete }
     }
 
-    /// Without the extension.
+    /// Length of a full classic frame, without the address byte.
     fn classic_len(&self) -> usize {
         CLASSIC - usize::from(self.extension.is_some())
     }
@@ -256,7 +257,7 @@ impl Received {
     }
 }
 
-/// `None` = the extension is missing or belongs to another address.
+/// The payload after the address byte `extension`. `None` = the payload is empty or begins with another address.
 fn without_extension(extension: Option<u8>, payload: &[u8]) -> Option<&[u8]> {
     match extension {
         None => Some(payload),

@@ -29,7 +29,7 @@ const ANSWER_WITHIN_NS: i64 = 1_000_000_000;
 pub enum CarState {
     Drive,
     Charge,
-    /// Also if the current is unknown.
+    /// Also used while the current is unknown.
     #[default]
     Parked,
 }
@@ -42,7 +42,7 @@ pub struct PollRequest {
     pub every_s: [Option<f64>; 3],
     /// Whether the response contains the pack current.
     pub has_current: bool,
-    /// Whether the response contains voltages. If so, the current is requested just before.
+    /// Whether the response contains voltages. If so, the current is requested just before this request.
     pub has_voltages: bool,
 }
 
@@ -51,7 +51,7 @@ pub struct PollRequest {
 pub struct PollConfig {
     /// Of several due requests, the first in this list is sent first.
     pub requests: Vec<PollRequest>,
-    /// Sent frames, including flow control.
+    /// Maximum number of sent frames per second, including flow control.
     pub max_requests_per_s: f64,
     /// Whether a supply voltage is configured. If so, nothing is sent without a good reading of this voltage.
     pub watches_supply: bool,
@@ -131,7 +131,7 @@ pub struct Poller {
     progress: PollProgress,
 }
 
-/// Progress of polling, from which the monitor resumes without a gap.
+/// Progress of polling, stored in a snapshot. Polling resumes from it if no frame was missed since the snapshot.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct PollProgress {
     items: Vec<Item>,
@@ -149,13 +149,13 @@ pub struct PollProgress {
 }
 
 impl PollProgress {
-    /// Shifts the end of the silence after another tester.
+    /// Shifts the end of the silence after another tester's request, to another clock.
     pub(crate) fn rebase(&mut self, by_nanos: i64) {
         self.foreign_until = self.foreign_until.plus_nanos(by_nanos);
     }
 
-    /// Drops everything that ends with the process. Returns whether standby or the silence after another tester
-    /// remains.
+    /// Drops everything that does not outlive the process. Returns whether polling is still stopped by standby or by
+    /// another tester's request.
     pub(crate) fn restart(&mut self, now: Timestamp) -> bool {
         (self.outstanding, self.latest, self.silence) = (None, None, None);
         self.items.clear();
@@ -197,8 +197,8 @@ impl Poller {
         &self.progress
     }
 
-    /// Restores standby and the silence after another tester. This silence starts again, because the tester may have
-    /// sent further requests. `taken`: time of the stored progress.
+    /// Restores standby and the silence after another tester's request. This silence starts again, because the tester
+    /// may have sent further requests. `taken`: time of the stored progress.
     pub fn restore_silence(&mut self, stored: &PollProgress, taken: Timestamp, now: Timestamp) {
         self.progress.is_standby = stored.is_standby;
         if stored.hears_tester(taken) {
@@ -372,7 +372,7 @@ impl Poller {
         }
     }
 
-    /// Time of the next [`poll`](Self::poll); `None` = only after a frame, a command or a reading.
+    /// Time of the next [`poll`](Self::poll); `None` = not before a frame, a command or a reading arrives.
     pub fn next_due(&self) -> Option<Timestamp> {
         match self.progress.silence {
             Some(PollSilence::OtherTester) => return Some(self.progress.foreign_until),
@@ -426,9 +426,9 @@ impl Poller {
         self.config.requests[index].every_s[self.progress.state as usize]
     }
 
-    /// Index of the request to send now. If the response to request `index` contains voltages but not the current, a
-    /// request for the current comes first. This does not apply if that request was the last one sent, failed the last
-    /// time or was rejected.
+    /// Index of the request to send now. If the response to request `index` contains voltages but not the current, the
+    /// request for the current is sent first. It is not sent first if it was the last request sent, if it failed the
+    /// last time, or if it was rejected.
     fn with_current_before(&self, index: usize) -> usize {
         let wanted = &self.config.requests[index];
         if !wanted.has_voltages || wanted.has_current {

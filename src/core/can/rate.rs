@@ -33,7 +33,7 @@ const WINDOW_NS: i64 = 1_000_000_000;
 /// A window may be suspicious above this multiple of the expected number of frames. A second sender with the same cycle
 /// time doubles the number.
 const EXCESS: f64 = 1.5;
-/// Additional frames of a normal window, because arbitration may delay frames into the window.
+/// Number of additional frames that a normal window may have, because arbitration may delay frames into the window.
 const DELAYED: f64 = 1.5;
 /// A second sender is found after this number of suspicious windows. A burst after a pause of the bus affects only one
 /// window.
@@ -48,8 +48,8 @@ const STEADY: (f64, f64) = (0.2, 1.0);
 const LEAST_PER_S: f64 = 3.0;
 /// An interval shorter than this fraction of the mean is short.
 const SHORT: f64 = 0.5;
-/// Number of unusual short intervals, or of alternating currents, that is a sign of a second sender: this multiple of
-/// the expected number of frames, at least 1.
+/// Signs of a second sender are unusual short intervals, or alternating currents. In a suspicious window, the number of
+/// signs is at least this multiple of the expected number of frames, and at least 1.
 const SIGNS: f64 = 0.4;
 /// Fraction of the frames that follow a short interval by chance, because other messages delay them.
 const CHANCE_SHORT: f64 = 0.02;
@@ -100,7 +100,7 @@ pub struct SecondSenders {
     /// From the DBC's cycle time, 1/s.
     configured_per_s: Vec<Option<f64>>,
     numbers: IdTable,
-    /// Earliest start of a window.
+    /// Start of the oldest open window; `None` = no window is open.
     next_end: Option<Timestamp>,
     pub(crate) changes: Vec<SenderChange>,
 }
@@ -229,7 +229,7 @@ impl MessageRate {
         if self.window_from.is_none() {
             self.window_from = Some(now);
         } else if self.candidate > 0.0 {
-            // Use the mean rate, because the rate of the open window is not known yet.
+            // Use the smoothed rate, because the rate of the open window is not known yet.
             let interval_ns = now.nanos().saturating_sub(self.latest.nanos()) as f64;
             self.short = self.short.saturating_add(u32::from(interval_ns * self.candidate < SHORT * WINDOW_NS as f64));
         }

@@ -170,8 +170,8 @@ impl Authentication {
     }
 }
 
-/// Maximum number of freshness values that one payload can represent: two announcements cover 32 values, and profile 3
-/// sends 4 bits (16 codes).
+/// Maximum number of freshness values that one payload can stand for. The receiver accepts at most 32 values (two
+/// announcements of 16), and profile 3 sends only 4 bits (16 codes).
 const MAX_CANDIDATES: usize = 2;
 
 /// The possible freshness values of a payload.

@@ -120,15 +120,15 @@ pub struct ControllerCounts {
     pub read: u64,
     /// Messages with other identifiers or services.
     pub other: u64,
-    /// Negative responses without "response pending".
+    /// Negative responses, except "response pending".
     pub refused: u64,
     pub pending: u64,
-    /// Code of the latest negative response, without "response pending".
+    /// Code of the latest negative response, except "response pending".
     pub latest_refusal: Option<u8>,
-    /// Decoded responses that do not answer the latest request, or arrive more than five seconds after it or after
-    /// "response pending".
+    /// Decoded responses that do not answer the latest request, or that arrive more than five seconds after the
+    /// request. After "response pending", the five seconds start again.
     pub unasked: u64,
-    /// Indexed like [`IsoTpFault::ALL`].
+    /// Number of lost messages by fault. Indexed like [`IsoTpFault::ALL`].
     pub lost: [u64; IsoTpFault::ALL.len()],
 }
 
@@ -240,7 +240,7 @@ pub struct Listener {
 }
 
 impl Listener {
-    /// Creates a listener. Responses to equal requests are merged.
+    /// Creates a listener. Answers with the same request are merged.
     pub fn new(answers: &[Answer]) -> Self {
         let mut sorted: Vec<Answer> = Vec::new();
         for answer in answers {

@@ -12,7 +12,7 @@ pub enum Quantity {
     Voltage,
     /// In degrees C.
     Temperature,
-    /// A quantity that packwatch does not read, with an article, such as `an angle`.
+    /// A quantity that packwatch does not read. The text is its name with an article, such as `an angle`.
     Other(&'static str),
 }
 
@@ -46,7 +46,7 @@ impl SignalUnit {
             "uv" => (Quantity::Voltage, 1e-6, 0.0),
             "kv" => (Quantity::Voltage, 1e3, 0.0),
             "c" | "degc" | "celsius" | "degcelsius" | "degreec" | "degreesc" => (Quantity::Temperature, 1.0, 0.0),
-            // Absolute zero.
+            // 0 K is -273.15 degrees C.
             "k" | "kelvin" | "degk" => (Quantity::Temperature, 1.0, -273.15),
             "f" | "degf" | "fahrenheit" => (Quantity::Temperature, 5.0 / 9.0, -160.0 / 9.0),
             other => (Quantity::Other(other_quantity(other)?), 1.0, 0.0),

@@ -1,13 +1,14 @@
 //! Computes how a cell type's open-circuit curve changes when a cell loses capacity.
 //!
 //! In: the SOC breakpoints of the model, and either the electrodes of the new cell or a shift of the SOC axis. Out: a
-//! table of offsets (V), which are added to the new cell's open-circuit voltage. Offsets are interpolated linearly.
-//! Outside the table, they stay constant over the capacity and continue linearly over the SOC.
+//! table of offsets (V) over capacity and SOC, which are added to the new cell's open-circuit voltage. Offsets are
+//! interpolated linearly. For a capacity outside the table, the offset of the nearest capacity applies. For a SOC
+//! outside the table, the offsets are extrapolated linearly.
 //!
 //! If a cell has lost a fraction x of its capacity, this module assumes that each electrode has lost the fraction
-//! [`MATERIAL_SHARE`] times x of its active material. Lost lithium explains the rest. The share is uncertain. For each
-//! electrode, the table therefore contains a "mix": the change of the offset if the share of this electrode is higher
-//! by one standard deviation ([`MATERIAL_SHARE_STD`]).
+//! [`MATERIAL_SHARE`] times x of its active material. Lost lithium explains the rest of the lost capacity. The material
+//! share is uncertain. For each electrode, the table therefore contains a "mix": the change of the offset if the
+//! material share of this electrode is higher by one standard deviation ([`MATERIAL_SHARE_STD`]).
 
 use super::electrodes::{Electrodes, LostMaterial};
 use crate::filter::locate;
@@ -15,7 +16,7 @@ use crate::filter::locate;
 /// How an aged curve is computed.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum AgeingLaw {
-    /// From a shift of the SOC axis. With shift 0, the curve over SOC does not change.
+    /// From a shift of the SOC axis ([`AgedOcv::of_shift`]). With shift 0, the curve over SOC does not change.
     Shift(f64),
     /// From the electrodes of the new cell.
     Electrodes(Electrodes),
@@ -52,11 +53,12 @@ pub struct AgedOcv {
     offset_v: Vec<Vec<f64>>,
     /// The two mixes (V), each with the shape of `offset_v`; empty = unknown.
     mixes_v: [Vec<Vec<f64>>; MIXES],
-    /// One row per capacity: lost lithium, as a fraction of the new cell's lithium, and its change by each mix.
+    /// One row per capacity: the lost lithium as a fraction of the new cell's lithium, then the change of this fraction
+    /// by each mix.
     lithium: Vec<Vec<f64>>,
     is_shift: bool,
     law: AgeingLaw,
-    /// Modes of the differences between cells (V), set by [`Self::add_spread`].
+    /// Typical shapes of the voltage difference between cells (V), set by [`Self::add_spread`].
     spread_v: [Vec<f64>; MIXES],
 }
 
@@ -141,8 +143,8 @@ impl AgedOcv {
 
     /// Computes the table from a shift. The aged curve is OCV(s + a s (1 - s)) with a = shift (1 - C / C_new). `rows`
     /// contains the new cell's open-circuit voltages (V), one row per temperature; the middle row is used. With shift
-    /// 1, each point near the top of the curve keeps its distance from full in Ah. With shift 0, this distance shrinks
-    /// with the capacity.
+    /// 1, a voltage near the top of the curve stays the same number of Ah away from full when the cell ages. With shift
+    /// 0, this number of Ah shrinks with the capacity.
     pub fn of_shift(shift: f64, soc: &[f64], new_capacity_ah: f64, rows: &[Vec<f64>]) -> Self {
         let mut table = Self { law: AgeingLaw::Shift(shift), ..Self::default() };
         let middle_v = &rows[rows.len() / 2];
@@ -163,8 +165,8 @@ impl AgedOcv {
         table
     }
 
-    /// Adds a row for the new cell and a row for a larger cell. The larger cell has the offsets of the smallest loss
-    /// with the opposite sign, so that the curve changes smoothly around the new cell's capacity.
+    /// Adds a row for the new cell and a row for a larger cell. The larger cell gets the offsets of the cell with the
+    /// smallest loss, with the opposite sign. The curve then changes smoothly around the new cell's capacity.
     fn finish(&mut self, new_capacity_ah: f64, rows: &[Vec<f64>]) {
         let Some((&aged_ah, aged_v)) = self.capacity_ah.last().zip(self.offset_v.last().cloned()) else { return };
         self.mixes_v.iter_mut().for_each(|table| table.extend(vec![vec![0.0; aged_v.len()]; 2]));
@@ -172,8 +174,8 @@ impl AgedOcv {
         self.push(2.0 * new_capacity_ah - aged_ah, aged_v.iter().map(|offset_v| -offset_v).collect(), rows);
     }
 
-    /// Adds a row of offsets. Scales the row down if the aged curve would otherwise fall with the SOC at some
-    /// temperature. This can happen because the new cell's tables can differ from the curve of its electrodes.
+    /// Adds a row of offsets. If the aged curve would fall with rising SOC at some temperature, scales the row down. A
+    /// curve can fall if the new cell's tables differ from the curve of its electrodes.
     fn push(&mut self, capacity_ah: f64, mut offset_v: Vec<f64>, rows: &[Vec<f64>]) {
         let factor = rows.iter().flat_map(|row| row.windows(2).zip(offset_v.windows(2))).fold(
             1.0_f64,
@@ -196,9 +198,9 @@ impl AgedOcv {
         }
     }
 
-    /// Adds the differences between cells: adds `modes_v[i]` to mix i at every capacity. A mode has one value per SOC
-    /// breakpoint (V per standard deviation). If mix and mode have opposite signs, the mix is negated first, so that
-    /// they do not cancel.
+    /// Adds the differences between cells of the same type. A mode is a typical shape of these differences, with one
+    /// value per SOC breakpoint (V per standard deviation). `modes_v[i]` is added to mix i at every capacity. If mix
+    /// and mode have opposite signs, they would cancel, so the mix is negated first.
     pub fn add_spread(&mut self, modes_v: &[Vec<f64>; MIXES]) {
         self.is_shift = false;
         self.spread_v.clone_from(modes_v);
@@ -216,8 +218,8 @@ impl AgedOcv {
         self.law
     }
 
-    /// The modes that [`Self::add_spread`] added (V per standard deviation, one value per SOC breakpoint). Empty if
-    /// there are no modes.
+    /// The modes that [`Self::add_spread`] added (V per standard deviation, one value per SOC breakpoint); empty
+    /// without such modes.
     pub fn spread_v(&self) -> &[Vec<f64>; MIXES] {
         &self.spread_v
     }

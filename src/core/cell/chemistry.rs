@@ -1,9 +1,9 @@
 //! Creates the model of a cell that was never measured, from its label and from the differences between cells of its
 //! chemistry.
 //!
-//! In: chemistry, rated capacity (Ah), cut-off voltages (V). Out: a [`CellModel`]. Its [`ModelSpread`] and the modes of
-//! its curve state how much a cell may differ from the model. No measured cell was used for the curve, so measured
-//! cells can be used to test it.
+//! In: chemistry, rated capacity (Ah), cut-off voltages (V). Out: a [`CellModel`]. Two of its parts state how much a
+//! cell may differ from the model: its [`ModelSpread`], and the modes of its curve (typical shapes of the differences
+//! between the curves of cells). No measured cell was used for the curve, so measured cells can be used to test it.
 //!
 //! * Open-circuit voltage: mean and covariance of cells built from published half-cell potentials ([`curve`]).
 //! * Resistances: proportional to 1 / capacity, for every chemistry. Geometric means and deviations come from five
@@ -107,21 +107,22 @@ pub struct Label {
     pub voltage_max_v: f64,
 }
 
-/// Prior of a cell without own data: from its label ([`Label::prior`]), or also from other vehicles
-/// ([`FleetPrior::prior`](super::FleetPrior::prior)).
+/// Prior: what is known about a cell before it was measured. It comes from the label ([`Label::prior`]), or from the
+/// label and from other vehicles ([`FleetPrior::prior`](super::FleetPrior::prior)).
 #[derive(Debug, Clone)]
 pub struct LabelPrior {
     /// The label.
     pub label: Label,
-    /// Model of the label's mean cell.
+    /// Model of the mean cell with this label.
     pub model: CellModel,
-    /// Open-circuit curve of the label's mean cell, and the covariance between cells.
+    /// Open-circuit curve of the mean cell with this label, and the covariance of the differences between cells.
     pub curve: CurvePrior,
-    /// Expected model; `None` = the model of the label's mean cell.
+    /// Expected model; `None` = the expected model is `model`.
     pub expected: Option<OwnModel>,
-    /// Standard deviation of ln(resistance) between cells, divided by the label's standard deviation.
+    /// Standard deviation of ln(resistance) between cells, divided by the standard deviation that the label alone
+    /// gives.
     pub log_resistance_ratio: f64,
-    /// Standard deviation of the curve's sag in the cold (V).
+    /// Standard deviation of the curve's sag in the cold (V), see [`CurveOfCells::cold_sag_v`].
     pub cold_sag_std_v: f64,
     /// Standard deviation of the capacity (fraction).
     pub capacity_std: f64,
@@ -177,13 +178,14 @@ impl ResistanceFactors {
 pub struct CurveOfCells {
     /// Mean (V), rising.
     pub mean_v: Vec<f64>,
-    /// Modes of the differences between cells (V per standard deviation).
+    /// Typical shapes of the differences between cells (V per standard deviation).
     pub modes_v: [Vec<f64>; MIXES],
     /// Standard deviation of the differences that the modes do not explain (V).
     pub rest_v: Vec<f64>,
-    /// Sag of the curve at 0 degrees C (V) (see [`cold_share`]).
+    /// Sag of the curve: how much lower it is under load at 0 degrees C than at 25 degrees C (V). [`cold_share`]
+    /// converts it to other temperatures.
     pub cold_sag_v: ScalarGaussian,
-    /// Electrodes that give a curve like the mean; `None` for blends.
+    /// Electrodes whose curve is close to the mean curve; `None` for a positive electrode that is a blend.
     pub electrodes: Option<Electrodes>,
 }
 
@@ -203,9 +205,10 @@ pub(super) fn cold_share(temperature_c: f64) -> f64 {
 /// Sag of the curve under load: how much lower it is at 0 degrees C than at 25 degrees C (V).
 ///
 /// The charge-transfer resistance is larger at small currents than at large currents (Butler-Volmer), especially in the
-/// cold. The model's resistances hold at large currents, so the difference is nearly a constant voltage. The value
-/// follows from the SOC errors of the label's model at 10, 0 and -10 degrees C: LG HG2 0.03 V, Panasonic 0.03 V (0.01 V
-/// of this is ageing), Leaf cell -0.01 V (only at 10 degrees C), simulated LG M50 0.
+/// cold. The model uses the resistances at large currents. Under load, the cell's voltage is therefore lower than the
+/// model's by a nearly constant amount. The value follows from the SOC errors of the label's model at 10, 0 and -10
+/// degrees C: LG HG2 0.03 V, Panasonic 0.03 V (0.01 V of this is ageing), Leaf cell -0.01 V (only at 10 degrees C),
+/// simulated LG M50 0.
 pub(super) fn usual_cold_sag_v() -> ScalarGaussian {
     ScalarGaussian::from_std(0.015, 0.015)
 }
@@ -250,7 +253,7 @@ impl Label {
         CurvePrior::new(&cell_type, &SOC)
     }
 
-    /// Model of the label's mean cell. Returns `None` in the same case as [`Self::curve`].
+    /// Model of the mean cell with this label. Returns `None` in the same case as [`Self::curve`].
     pub fn model(&self) -> Option<CellModel> {
         self.prior().map(|prior| prior.model)
     }
@@ -264,10 +267,11 @@ impl Label {
             // From the five fitted cells. Away from 25 degrees C, the temperature law adds uncertainty.
             log_resistance: 0.45,
             slow_branch: 0.5,
-            // Tolerance and age of the cell.
+            // A cell may differ from its label by the tolerance of manufacture and by its age.
             capacity: 0.1,
-            // The drop has an error of 40 % that persists for 100 s, because the resistances of cells depend
-            // differently on time, SOC and temperature. Chosen on LG HG2 from 0 to -10 degrees C.
+            // The voltage drop is assumed to have an error of 40 % that persists for 100 s, because the resistances of
+            // different cells depend differently on time, SOC and temperature. The value was chosen with the LG HG2
+            // cell at 0 to -10 degrees C.
             drop_sqrt_s: 4.0,
         };
         let CurvePrior { mean_v, electrodes, .. } = curve.clone();
@@ -287,8 +291,8 @@ impl Label {
     }
 
     /// The model of a cell with this present capacity (Ah), curve and resistances. `drop_std` is the standard deviation
-    /// of ln(voltage drop) at each temperature of the tables. Multiplied by the voltage drop at [`USUAL_LOAD_PER_H`],
-    /// it counts as a voltage error of the model.
+    /// of ln(voltage drop) at each temperature of the tables. `drop_std` times the voltage drop at the load
+    /// [`USUAL_LOAD_PER_H`] counts as a voltage error of the model.
     pub fn model_of(
         &self,
         capacity_ah: f64,

@@ -36,13 +36,13 @@ pub struct EstimatorConfig {
     pub process: ProcessNoise,
     /// Possible change of the SOC while no current is measured.
     pub gap: GapSettings,
-    /// Error of a voltage reading against the cell model.
+    /// Errors of a voltage reading and of the voltage that the cell model predicts.
     pub voltage: VoltageError,
     /// Constant errors of the sensors.
     pub sensor: SensorErrors,
-    /// Rejection of outliers.
+    /// Rejection of outlying voltage readings.
     pub gate: GateSettings,
-    /// Check of the innovations against their variance.
+    /// Check whether the innovations (measured minus predicted voltage) are as large as their variance says.
     pub consistency: ConsistencySettings,
 }
 
@@ -82,8 +82,8 @@ pub struct InitialState {
 pub struct ProcessNoise {
     /// Noise of the SOC (fraction per sqrt(s)).
     pub soc_per_sqrt_s: f64,
-    /// Noise of the SOC caused by random errors of the current: fraction per square root of the charge moved. The
-    /// charge is a fraction of the capacity.
+    /// Noise of the SOC caused by random errors of the current, per square root of the charge moved. Noise and charge
+    /// are fractions of the capacity.
     pub charge_per_sqrt_soc: f64,
     /// Noise of a branch voltage (V per sqrt(s)).
     pub branch_v_per_sqrt_s: f64,
@@ -100,39 +100,41 @@ pub struct GapSettings {
     pub self_discharge_per_s: f64,
     /// Largest change of the SOC by use or charging while the program does not run (fraction of SOC per s).
     pub away_use_per_s: f64,
-    /// Largest current (A) of a resting cell. A larger current before or after a gap may also have flowed during the
-    /// gap.
+    /// Largest current (A) of a resting cell. If a larger current flows before or after a gap, it may also have flowed
+    /// during the gap.
     pub rest_current_a: f64,
-    /// Whether the cell counts as resting in every gap of more than 5 s without a measured current, whatever the
-    /// current before and after the gap.
+    /// Whether the cell counts as resting during every gap of more than 5 s without a measured current, even if a
+    /// current flows before and after the gap.
     pub silence_is_rest: bool,
 }
 
-/// Error of a voltage reading against the cell model.
+/// Errors of a voltage reading and of the voltage that the cell model predicts.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct VoltageError {
     /// White sensor noise of one voltage reading (V).
     pub noise_v: f64,
     /// Slow model error: standard deviation of its average over one second (V). Used if the cell model states no error.
     pub model_error_v_sqrt_s: f64,
-    /// Model error proportional to the present voltage drop in the cell: fraction of the drop, averaged over one
-    /// second.
-    pub drop_error_sqrt_s: f64,
-    /// Model error proportional to the voltage drop caused by the load of the last minutes: fraction of this drop,
+    /// Part of the model error that is proportional to the present voltage drop in the cell: fraction of the drop,
     /// averaged over one second.
+    pub drop_error_sqrt_s: f64,
+    /// Part of the model error that is proportional to the voltage drop by the load of the last minutes: fraction of
+    /// this drop, averaged over one second.
     pub load_error_sqrt_s: f64,
     /// Time constant (s) with which the model error decays after a load has ended (slow diffusion).
     pub load_memory_s: f64,
-    /// A voltage reading represents at most this time (s), even if readings are further apart.
+    /// A voltage reading gives at most as much information as readings over this time (s), even if the readings are
+    /// further apart.
     pub max_information_s: f64,
 }
 
-/// Standard deviations of the sensors' constant errors. The filter considers them, so they never average out.
+/// Standard deviations of the sensors' constant errors (errors that do not change with time). The filter adds their
+/// effect to its variances, and this effect never averages out.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SensorErrors {
     /// Offset of a cell's voltage (V), including a constant error of the model's open-circuit curve.
     pub voltage_offset_v: f64,
-    /// Offset of the current sensor (A) per cell that remains after learning.
+    /// Offset of the current sensor that remains after learning (A), divided by the number of parallel strings.
     pub current_offset_a: f64,
     /// Gain error of the current (fraction).
     pub current_gain: f64,
@@ -146,13 +148,13 @@ impl SensorErrors {
     pub const NONE: Self = Self { voltage_offset_v: 0.0, current_offset_a: 0.0, current_gain: 0.0, slow_branch: 0.0 };
 }
 
-/// Rejection of outliers.
+/// Rejection of outlying voltage readings (the "gate").
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GateSettings {
     /// Maximum accepted innovation, in standard deviations.
     pub sigma: f64,
-    /// Model error of a single reading (V, standard deviation) for the gate and the consistency monitor. With the error
-    /// per second instead, the gate and the monitor would accept every reading at high sample rates.
+    /// Model error of a single reading (V, standard deviation). The gate and the consistency monitor use it instead of
+    /// the error averaged over one second, with which they would accept every reading at a high sample rate.
     pub model_error_v: f64,
     /// Model error of a single reading along the OCV curve (fraction of SOC).
     pub soc_error: f64,
@@ -160,11 +162,11 @@ pub struct GateSettings {
     pub lost_after_s: f64,
 }
 
-/// Check of the innovations against their variance.
+/// Check whether the innovations (measured minus predicted voltage) are as large as their variance says.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ConsistencySettings {
     /// Window of the consistency monitor (s).
     pub window_s: f64,
-    /// Maximum mean normalised innovation squared of a trusted estimate.
+    /// An estimate is trusted if the mean of squared innovation divided by variance is at most this limit.
     pub limit: f64,
 }

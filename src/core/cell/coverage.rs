@@ -1,7 +1,8 @@
 //! Determines which ranges of SOC and temperature the data cover.
 //!
-//! In: SOC (fraction) and temperature (degrees C) of readings or of notebook rows. NaN and infinities are ignored. Out:
-//! the covered share of the SOC range, and the covered ranges of SOC and temperature.
+//! In: SOC (fraction) and temperature (degrees C) of readings, or of the averaged readings in a notebook
+//! ([`super::notebook`]). NaN and infinities are ignored. Out: the covered share of the SOC range, and the covered
+//! ranges of SOC and temperature.
 
 use std::collections::BTreeMap;
 

@@ -10,8 +10,8 @@
 //! material need not be known, because it only changes n, and n follows from the capacity.
 //!
 //! In: materials and lithium contents of the new cell. Out: V, and capacity as a fraction of the new cell's capacity.
-//! Contents are limited to 0 to 1. If no such cell exists after a loss, there is no curve. An ageing cell never gains
-//! lithium.
+//! Contents are limited to 0 to 1. If a cell with the given losses and capacity cannot exist, there is no curve. An
+//! ageing cell never gains lithium.
 
 use crate::filter::crossing;
 

@@ -1,8 +1,8 @@
 //! Estimates one cell's state, sample by sample, with an unscented Kalman filter.
 //!
 //! State x = [SOC, ln rho, C, U_1 .. U_n]: state of charge (fraction), logarithm of the resistance relative to a new
-//! cell, capacity (Ah), branch voltages (V); n = 1 to 3 branches. The branch voltages come last, because a linear map
-//! moves their sigma points.
+//! cell, capacity (Ah), branch voltages (V); n = 1 to 3 branches. P is the covariance of x. The branch voltages come
+//! last, because a linear map moves their sigma points.
 //!
 //! Prediction over the charge q (A s) and the time dt (s) since the last sample: SOC -= q / (3600 C). Each U_i follows
 //! `circuit::BranchAt` with the mean current q/dt.
@@ -20,25 +20,27 @@
 //! this correlation, the filter would treat its assumed capacity as if it had been measured. `Held` gives the paper's
 //! filter (C known, variance 1e-12 Ah^2).
 //!
-//! Deviation 3: process noises are densities per second, and the measurement variance is sensor^2 + model^2 / dt.
-//! Reason: the model error changes slowly, so information is counted per second and not per sample. Effect: the sample
-//! rate does not change the result.
+//! Deviation 3: process noises are densities per second. The measurement variance is sensor^2 + model^2 / dt, with the
+//! standard deviations of the sensor's noise and of the model's error over one second. Reason: the model error changes
+//! slowly, so information is counted per second and not per sample. Effect: the sample rate does not change the result.
 //!
 //! Deviation 4: model^2 = base^2 + (k drop)^2 + (k' load)^2. The base is the error that the cell model states, or a
 //! configured constant. The drop is the present voltage drop in the cell. The load is the voltage drop caused by the
 //! load of the last minutes. Reason: most of the model error comes from the resistances and from diffusion that is
-//! slower than the branches. Effect: voltages count less when a log starts under load, in the constant-voltage part of
-//! a charge, and in cold cells. At rest, the error repeats instead of averaging out. A rest of duration t therefore
-//! gives only as much information as the time t_r ln(1 + t/t_r) under load, with t_r = 1000 s.
+//! slower than the branches. Effect: voltages have less weight when a log starts under load, in the constant-voltage
+//! part of a charge, and in cold cells. During a rest, all readings have nearly the same model error, so it does not
+//! average out. A rest of duration t therefore gives only as much information as the time t_r ln(1 + t/t_r) under load,
+//! with t_r = 1000 s.
 //!
-//! Deviation 5: the OCV curve changes with the lost capacity ([`AgedOcv`](crate::cell::AgedOcv)), as learned up to the
-//! end of the last half-cycle (charge or discharge). Effect: readings at the top and at the bottom of an aged cell's
-//! curve give the same capacity.
+//! Deviation 5: the OCV curve changes with the lost capacity ([`AgedOcv`](crate::cell::AgedOcv)). The curve belongs to
+//! the capacity that was learned up to the end of the last half-cycle (charge or discharge). Effect: readings at the
+//! top and at the bottom of an aged cell's curve give the same capacity.
 //!
-//! Deviation 6: the cell may be used while the program does not run, see [`downtime`].
+//! Deviation 6: the filter allows for use of the cell while the program did not run, see [`downtime`].
 //!
-//! Deviation 7: the filter tracks the effects of the constant errors of sensors and model. The gain takes the errors of
-//! [`SensorErrors`](crate::cell::SensorErrors) into account (see below).
+//! Deviation 7: the filter tracks the effects of constant errors, which are errors of the sensors and of the model that
+//! do not change with time. The gain takes the errors of [`SensorErrors`](crate::cell::SensorErrors) into account (see
+//! below).
 //!
 //! Deviation 8: the offset of the current sensor is learned ([`crate::health::offset`]).
 //!
@@ -51,11 +53,13 @@
 //!
 //! For each constant error, the filter keeps a column: the shift of each state that one standard deviation of this
 //! error has caused. The gain considers the first [`CONSIDERED`](state_vector::CONSIDERED) constant errors (Schmidt
-//! 1966): an update weighs the voltage by its covariance with these errors. This gain is not optimal for P alone, so P
-//! is updated in Joseph's form. The remaining constant errors do not change the mean (Friedland 1969).
+//! 1966): the weight of a voltage in an update depends also on the shifts that these errors cause. This gain is not
+//! optimal for P alone, so P is updated in Joseph's form. The remaining constant errors do not change the mean
+//! (Friedland 1969).
 //!
-//! A reading beyond the gate does not change the state. If all readings of `lost_after_s` were beyond the gate, the
-//! filter restarts: it determines SOC and branch voltages from the voltage, and keeps resistance and capacity.
+//! The gate is a bound on measured minus predicted voltage. A reading beyond the gate does not change the state. If all
+//! readings during `lost_after_s` were beyond the gate, the filter restarts: it determines SOC and branch voltages from
+//! the voltage, and keeps resistance and capacity.
 
 mod bank;
 mod cell_estimator;

@@ -9,8 +9,9 @@
 //! toward the label's mean, so the means vary less than the cells. The missing variance is V^2 / L (Joseph form of the
 //! update). P is estimated as the variance of the means plus V^2 / L.
 //!
-//! For the curve, L is a covariance matrix over the SOC breakpoints, and each vehicle scales its rows and columns by V
-//! / L. Because few vehicles say little about P, the label's covariance counts as [`LABEL_VEHICLES`] more vehicles.
+//! For the open-circuit curve, L is a covariance matrix over the SOC breakpoints. For each vehicle, row and column of a
+//! breakpoint are multiplied by the ratio V / L at this breakpoint. Because few vehicles say little about P, the
+//! label's covariance counts as [`LABEL_VEHICLES`] more vehicles.
 
 use nalgebra::DMatrix;
 use serde::{Deserialize, Serialize};

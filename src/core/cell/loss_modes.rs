@@ -33,8 +33,8 @@ pub struct LossModes {
 }
 
 impl LossModes {
-    /// Losses of a cell with this capacity (Ah). `None` if the model has no electrodes or no curve down to this
-    /// capacity.
+    /// Losses of a cell with this capacity (Ah). `None` if the model has no electrode data, or if its aged open-circuit
+    /// curves end above this capacity.
     pub fn of_capacity(aged_ocv: &AgedOcv, new_capacity_ah: f64, capacity: ScalarGaussian) -> Option<Self> {
         let LithiumLoss { lost, per_ah, mixes, mixes_per_ah } = aged_ocv.lithium_loss(capacity.mean)?;
         let by_mixes =

@@ -5,12 +5,14 @@
 //! model. If the model states no error of its curve, voltage and SOC are `None`. The estimator starts with the same
 //! standard deviations.
 //!
-//! * Curve: the modes of the differences between cells, and the smallest `voltage_error_v` of all temperatures at this
-//!   SOC. At the temperature with the smallest error, the resistances matter least, so this error is mostly an error of
-//!   the curve. Without such a table, the constant error of the spread is used.
-//! * Resistances: a common error (`log_resistance` of the spread) and a local error that differs between SOC and
-//!   temperatures. The local error has two parts: the standard deviation of the voltage drop over [`ERROR_WINDOW_S`],
-//!   and the part of `voltage_error_v` beyond the curve's error. Both are relative to the drop at a usual load.
+//! * Curve: the modes (typical shapes) by which the curves of cells differ, and a remaining error. The remaining error
+//!   is the smallest `voltage_error_v` of all temperatures at this SOC. Where this error is smallest, the resistances
+//!   matter least, so it is mostly an error of the curve. If the model has no table `voltage_error_v`, the constant
+//!   `curve_v` of its [`ModelSpread`] is used.
+//! * Resistances: a common error (`log_resistance` of the spread) and a local error, which depends on SOC and
+//!   temperature. The local error has two parts: the relative standard deviation of the voltage drop over
+//!   [`ERROR_WINDOW_S`], and the part of `voltage_error_v` that exceeds the curve's error, relative to the drop at a
+//!   usual load.
 
 mod advice;
 
@@ -59,8 +61,8 @@ impl<'a> ModelBands<'a> {
         self.model.ocv_v(&self.at(soc))
     }
 
-    /// Slope of the open-circuit voltage at [`CURVE_C`] (V per unit of SOC), over 5 % of SOC, which is the resolution
-    /// of a filter.
+    /// Slope of the open-circuit voltage at [`CURVE_C`] (V per unit of SOC), averaged over 5 % of SOC. The SOC filter
+    /// does not resolve less.
     pub fn slope_v(&self, soc: f64) -> f64 {
         let (low, high) = ((soc - 0.025).max(0.0), (soc + 0.025).min(1.0));
         (self.ocv_v(high) - self.ocv_v(low)) / (high - low)

@@ -1,4 +1,4 @@
-//! Checks in windows of an hour of use whether the configured model fits the cell.
+//! Checks whether the configured model fits the cell. A check takes a window of one hour of use.
 //!
 //! In: innovations (V) with their variances (V^2), SOC and the learned resistance, every 10 s of use. Out: after 10
 //! minutes of use, [`ModelCheck::mismatch`], which is above 1 if the model belongs to another cell. Readings at rest,
@@ -9,12 +9,12 @@
 //! * r^2, the square of ln(resistance relative to a new cell) divided by its configured standard deviation.
 //! * c^2 = g' (A + P^-1)^-1 g, the part of the innovations v that a constant a and a slope b over SOC explain (score
 //!   test; Cox and Hinkley, Theoretical Statistics, 1974, section 9.3). A and g are the sums of `h h' / R` and `h v /
-//!   R` with h = (1, SOC - 0.5). R is the variance over the time that a reading represents. P contains the variances of
-//!   a and b between chemistries.
+//!   R` with h = (1, SOC - 0.5). R is the variance of an innovation, scaled to the time that the reading represents. P
+//!   contains the variances of a and b for the models of other cells ([`CURVE_STD_V`]).
 //!
-//! In the sum of both, each kind counts at most [`CORROBORATED`] times as much as the other kind, because other causes
-//! affect only one of them. An aged cell has a higher resistance, but its voltages fit. A local error of a cell's own
-//! curve does not change the resistance. With another cell's model, both are large.
+//! The two kinds are added up. Each kind counts at most [`CORROBORATED`] times as much as the other, because only a
+//! wrong model makes both large. An aged cell has a higher resistance, but its voltages fit. A local error of a cell's
+//! own curve does not change the resistance.
 //!
 //! The check ends after [`WINDOW_S`] without a mismatch, because a cell does not become another cell. After a mismatch,
 //! the following windows are judged until a window has no mismatch. An aged cell is thus trusted again after its
@@ -96,7 +96,7 @@ impl VoltageSums {
         self.score[0] += weight * innovation;
     }
 
-    /// c^2 of the module header. Products that cancel are left out, so no term is negative.
+    /// Computes c^2 (see the module header). Products that cancel each other are left out, so no term is negative.
     fn explained(&self) -> f64 {
         let Self { weight, mean_soc, spread, score: [constant, slope] } = *self;
         let [prior_constant, prior_slope] = CURVE_STD_V.map(|std| 1.0 / square(std));
@@ -128,7 +128,7 @@ pub struct ModelEvidence {
     pub log_resistance_std: f64,
 }
 
-/// Identifies a cell model and the expected spread of resistances: FNV-1a of all inputs of the check.
+/// Identifies a cell model and the expected spread of resistances: the FNV-1a hash of all inputs of the check.
 pub fn model_id(model: &CellModel, log_resistance_std: f64) -> u64 {
     let CellModel { soc, temperature_c, ocv_v, r0_ohm, branches, rated_capacity_ah, .. } = model;
     let text =

@@ -1,7 +1,8 @@
 //! Compares two cell models: open-circuit curves (V), resistances (fraction), and resulting SOC errors (fraction).
 //!
-//! In: two [`CellModel`]s. Out: values of the second model minus values of the first. So that cells of different size
-//! can be compared, resistances are multiplied by the rated capacity, and the load of each cell is C/2.
+//! In: two [`CellModel`]s. Out: values of the second model minus values of the first. To compare cells of different
+//! size, resistances are multiplied by the rated capacity, and the load of each cell is C/2 (half of its rated capacity
+//! per hour).
 
 use super::chemistry::USUAL_LOAD_PER_H;
 use super::model::CellModel;
@@ -10,7 +11,8 @@ use super::model_bands::CURVE_C;
 const CURVE_STEPS: u32 = 100;
 /// Number of SOC steps in the table that gives the SOC of a voltage; a multiple of `CURVE_STEPS`.
 const READ_STEPS: u32 = 400;
-/// SOC range in which SOC errors count. Outside, curves are so steep that the SOC errors of any model are small.
+/// SOC range in which SOC errors count. Outside this range, curves are so steep that the SOC errors of any model are
+/// small.
 const MIDDLE: (f64, f64) = (0.05, 0.95);
 
 /// A difference at one SOC.
@@ -40,7 +42,7 @@ pub struct AtTemperature {
     pub series: Difference,
     /// Relative difference (fraction) of settled resistance (all branches settled) times rated capacity.
     pub settled: Difference,
-    /// SOC (fraction) read from a voltage under C/2.
+    /// Difference of the SOC (fraction) that the models read from the same voltage under C/2.
     pub load_soc: Difference,
 }
 
@@ -51,7 +53,7 @@ pub struct ModelComparison {
     pub curve_v: Vec<AtSoc>,
     /// Summary of `curve_v`.
     pub curve: Difference,
-    /// SOC (fraction) read from a voltage at rest.
+    /// Difference of the SOC (fraction) that the models read from the same voltage at rest.
     pub rest_soc: Difference,
     /// Relative difference of the capacity (fraction).
     pub capacity: f64,

@@ -8,9 +8,9 @@
 //! stretch, the current, and the current after first-order filters with the time constants of the branches. Each row
 //! can therefore be predicted without its neighbours, and single rows can be removed.
 //!
-//! A mean hides current steps, so these are stored as the sums of a small regression. Rows are classified by SOC,
-//! temperature and direction of the current. A full notebook removes the oldest row of the class with the most rows, so
-//! that rare rows are kept.
+//! A mean hides current steps, so a row also contains the sums of a small regression over its steps. Rows are
+//! classified by SOC, temperature and direction of the current. A full notebook removes the oldest row of the class
+//! with the most rows, so that rare rows are kept.
 
 use serde::{Deserialize, Serialize};
 
@@ -30,7 +30,7 @@ const CLASS_SOC: f64 = 0.1;
 /// Maximum current at rest, in units of the 1 C current.
 const REST_PER_H: f64 = 0.02;
 
-/// Number of current filters: one per branch of a model made from a label.
+/// Number of current filters: one per branch of a cell model that is made from a label (chemistry and rated capacity).
 pub const FILTERS: usize = 3;
 
 /// The mean cell over a short time.
@@ -242,7 +242,7 @@ impl Notebook {
         let (cells, count) = (f64::from(config.cells), f64::from(count));
         let temperature_c = if temperatures > 0 { temperature_c / f64::from(temperatures) } else { ambient_c };
         let (dt_s, current_a, voltage_v) = (measured_s / cells, current_a / count, voltage_v / count);
-        // If the current was unmeasured for more than 10 s, the stretch ends. The sum is over all cells.
+        // If the current was unmeasured for more than 10 s, the stretch ends. `unmeasured_s` is a sum over all cells.
         if unmeasured_s > 10.0 * cells {
             self.end_stretch(config);
         }
@@ -348,7 +348,7 @@ impl Notebook {
 
     fn make_room(&mut self, config: &NotebookConfig) {
         let class_of = |row: &Row| row.class(config.rated_ah);
-        // Each stretch adds a parameter to the fit: its initial SOC.
+        // Each stretch adds a parameter to the fit (its initial SOC), so at most 16 stretches are kept.
         if self.rows.chunk_by(|a, b| a.stretch == b.stretch).count() > 16
             && let Some(dropped) = self.least_missed(config)
         {

@@ -1,5 +1,5 @@
-//! Cell model of this pack's own cells: the model of the label (chemistry, rated capacity, voltage limits), corrected
-//! by the vehicle's readings.
+//! Cell model of this pack's own cells. It starts from the model of the label (chemistry, rated capacity, voltage
+//! limits) and is corrected by the vehicle's readings.
 //!
 //! In: a [`Label`] and the rows (averaged readings) of a [`Notebook`](super::notebook::Notebook). Out: an [`OwnModel`],
 //! from which the [`CellModel`] of the filters is made. In SOC and temperature ranges without rows, the label's model
@@ -26,9 +26,10 @@ pub const SOC_NODES: usize = 21;
 pub struct OwnModel {
     /// Open-circuit curve (V), rising.
     pub curve_v: [f64; SOC_NODES],
-    /// Independent modes of the curve's uncertainty (V per standard deviation).
+    /// Two independent shapes (modes) of the curve's error: the voltage at each node that one standard deviation adds
+    /// (V).
     pub modes_v: [[f64; SOC_NODES]; 2],
-    /// Standard deviation of the curve (V) that the modes do not explain.
+    /// Standard deviation of the part of the curve's error that the modes do not explain (V).
     pub rest_v: [f64; SOC_NODES],
     /// Resistances relative to the resistances of the label's model.
     pub factors: ResistanceFactors,
@@ -63,7 +64,7 @@ impl OwnModel {
         Some(model)
     }
 
-    /// Differences between the cells of this pack.
+    /// Expected differences between the cells of this pack.
     pub(super) fn spread_within_pack(&self) -> ModelSpread {
         ModelSpread {
             curve_v: median(self.rest_v.iter().copied()).unwrap_or_default(),
@@ -79,7 +80,7 @@ impl OwnModel {
     /// The estimator's settings for the learned `model`, derived from the settings for the label's model.
     pub fn estimator_config(&self, base: &EstimatorConfig, label: &CellModel, model: &CellModel) -> EstimatorConfig {
         let (Some(old), Some(new)) = (label.spread, model.spread) else { return *base };
-        // Keeps values that come from the configuration and not from the label.
+        // Values of `base` that differ from the label's values come from the configuration and are kept.
         let instead = |value: f64, old: f64, new: f64| if value == old { new } else { value };
         let parts = |value: f64, old: f64, new: f64| (value * value - old * old).max(0.0).sqrt().hypot(new);
         let mut config = *base;
@@ -128,8 +129,8 @@ impl OwnModel {
     }
 }
 
-/// Cost of rows: minus the logarithm of the probability density that the model `own` gives the rows (`None` = the
-/// label's model). Returns `None` without rows.
+/// Returns the cost of the rows under a model: minus the logarithm of the rows' probability density. The model is
+/// `own`, or the label's model if `own` is `None`. Returns `None` if there are no rows.
 pub fn rows_cost(prior: &LabelPrior, own: Option<&OwnModel>, rows: &[Row]) -> Option<f64> {
     fit::rows_cost(prior, own, rows)
 }

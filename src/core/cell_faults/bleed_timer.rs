@@ -4,8 +4,8 @@
 //! In: balancing bits with their expiry, and the starts and ends of rows (a few minutes of samples each). Out: for
 //! the time from the middle of one row to the middle of the next, a [`BleedTime`].
 //!
-//! A row shows the charge at its middle, so half of its bleed time counts in the next row. Bleed time between two
-//! rows, while the buses sleep, counts in the later row.
+//! A row gives the charge of the cell at the middle of the row, so half of the row's bleed time counts in the next row.
+//! Bleed time between two rows, while the buses sleep, counts in the later row.
 
 use serde::{Deserialize, Serialize};
 

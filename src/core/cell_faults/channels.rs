@@ -10,8 +10,8 @@ use crate::quantity::InvalidState;
 /// frozen (V).
 const FROZEN_V: f64 = 0.03;
 /// Minimum number of voltage changes within a row (a few minutes of samples) for a comparison of channels.
-/// [`Channel::doubled`] also requires that the channels agree in ten consecutive rows. With a resolution of 2.5 mV,
-/// two of 96 healthy cells agreed in three rows.
+/// [`Channel::doubled`] also requires that the channels agree in ten consecutive rows. Fewer rows are not enough: at a
+/// resolution of 2.5 mV, two of 96 healthy cells agreed in three rows.
 const LEAST_CHANGES: u32 = 10;
 
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]

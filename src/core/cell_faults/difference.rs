@@ -1,8 +1,8 @@
 //! Filter of the difference between one cell and the middle of its pack.
 //!
-//! In: per row (a few minutes of samples), the cell's voltage minus the middle voltage of the pack. Out: the states
-//! that explain this voltage difference. The filter is a linear Kalman filter, linearised at the cell's own SOC. It
-//! can distinguish the states because their effects differ:
+//! In: per row (a few minutes of samples), the cell's voltage minus the middle voltage of the pack, which is the mean
+//! of the middle half of the cell voltages. Out: the states that explain this voltage difference. The filter is a
+//! linear Kalman filter, linearised at the cell's own SOC. It can distinguish the states because their effects differ:
 //!
 //! | state | effect on the voltage difference |
 //! | --- | --- |
@@ -40,9 +40,10 @@ const PAIRS: usize = STATES * (STATES + 1) / 2;
 
 /// Standard deviations before the first row. The value for the voltage channel is typical of cell monitors.
 const FIRST_STD: [f64; STATES] = [0.05, 0.1, 0.2, 0.5, 0.005, 0.05];
-/// Random walk of the states: standard deviations gained within one day. `MOVED_STD`: standard deviation that the
-/// state [`SOC`] gains per unit of SOC that the mean cell moves.
+/// Random walk of the states: standard deviations gained within one day.
 const DAILY_STD: [f64; STATES] = [1e-4, 3e-4, 5e-3, 5e-3, 3e-4, 1e-4];
+/// Standard deviation that the state [`SOC`] gains during a charge or discharge, per unit of change of the mean cell's
+/// SOC.
 const MOVED_STD: f64 = 5e-4;
 /// Standard deviations added after a sudden change of a single cell: its contact or its channel has changed, or the
 /// cell has been replaced. The value for the SOC is small, because the SOC cannot change without a current.

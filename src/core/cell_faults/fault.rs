@@ -158,7 +158,7 @@ impl CellFaultKind {
     }
 
     /// If the probability is below this value, the finding is withdrawn. The value is lower for a leak, because a known
-    /// leak is hidden while the BMS bleeds the other cells.
+    /// leak is hidden while the BMS balances the pack, that is, discharges the other cells.
     pub(super) const fn withdrawn_below(self) -> f64 {
         match self {
             Self::Leak => 0.01,
@@ -166,7 +166,7 @@ impl CellFaultKind {
         }
     }
 
-    /// Whether the cell's own voltage channel fails. Nothing else is then known about the cell.
+    /// Whether the fault is in the cell's own voltage channel. If so, nothing else is known about the cell.
     pub const fn is_of_channel(self) -> bool {
         matches!(self, Self::VoltageChannel | Self::VoltageFrozen | Self::DoubledChannels)
     }
@@ -176,8 +176,8 @@ impl CellFaultKind {
         self.is_of_channel() || matches!(self, Self::SwappedChannels)
     }
 
-    /// Size (absolute value) above which a finding of this kind applies. The limit does not decide the kinds for
-    /// which it is 0.5.
+    /// Size (absolute value) above which a finding of this kind applies. Kinds with the limit 0.5 are decided by other
+    /// conditions.
     pub(super) const fn limit(self) -> f64 {
         match self {
             Self::Leak => LEAK_PER_DAY,
@@ -257,8 +257,8 @@ pub const CHARGE: f64 = 0.01;
 /// Limit of the voltage channel's offset (V).
 pub const CHANNEL_V: f64 = 0.015;
 
-/// Limit of the current sensor's offset, fraction of the rated capacity per hour. At this limit, the counted SOC drifts
-/// by 24 % per day.
+/// Limit of the current sensor's offset, fraction of the rated capacity per hour. At this limit, an SOC from coulomb
+/// counting drifts by 24 % per day.
 pub const OFFSET_PER_H: f64 = 0.01;
 
 /// Limit of the rise of the current sensor's gain, fraction.

@@ -3,8 +3,9 @@
 //! In: once per day, the learned capacity and resistance of all cells. Out: the rise of the gain.
 //!
 //! If the sensor begins to show `g` times the true current, every learned resistance changes by the factor `1/g` at
-//! once. Every learned capacity changes by the factor `g` as new half-cycles are measured. In a real battery, the
-//! capacity never rises while the resistance falls. A falling gain looks like ageing and is not reported.
+//! once. Every learned capacity changes by the factor `g` as new half-cycles (charges and discharges) are measured. In
+//! a real battery, the capacity never rises while the resistance falls. A falling gain looks like ageing and is not
+//! reported.
 
 use serde::{Deserialize, Serialize};
 

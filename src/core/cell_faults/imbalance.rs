@@ -1,8 +1,9 @@
 //! Computes how much charge the pack loses by imbalance and by its weakest cell, and which cells limit the pack.
 //!
 //! In: each cell's difference from the middle of the pack in SOC, capacity and resistance; SOC and capacity of the
-//! middle cell. Out: [`Imbalance`], in fractions of the mean of the cells' capacities. A charge ends when the first
-//! cell is full, a discharge when the first cell is empty. With the SOC s and the capacity C of each cell:
+//! middle cell (the robust mean of the cells). Out: [`Imbalance`], in fractions of the mean of the cells' capacities. A
+//! charge ends when the first cell is full, a discharge when the first cell is empty. With the SOC s and the capacity C
+//! of each cell:
 //!
 //! ```text
 //! usable            = min s C + min (1 - s) C
@@ -30,8 +31,8 @@ use crate::cell::CellModel;
 use crate::filter::ScalarGaussian;
 use crate::quantity::{CellIndex, Timestamp};
 
-/// If the standard deviation of a cell's SOC or capacity is at least this (fraction), the cell counts as unknown.
-/// These are half of the filter's initial values.
+/// If the standard deviation of a cell's SOC or capacity is at least this (fraction), the cell counts as unknown. The
+/// two limits are half of the standard deviations with which the filter of the differences starts.
 const UNKNOWN_SOC_STD: f64 = 0.025;
 const UNKNOWN_CAPACITY_STD: f64 = 0.05;
 const OCV_PARTS: u32 = 100;
@@ -50,8 +51,8 @@ pub struct Imbalance {
     pub usable: ScalarGaussian,
     /// Charge that balancing would recover, fraction.
     pub lost_by_imbalance: ScalarGaussian,
-    /// Charge that a balanced pack of mean cells would deliver, minus the charge that this pack would deliver after
-    /// balancing; fraction.
+    /// Charge that a balanced pack of equal mean cells would deliver, minus the charge that this pack would deliver
+    /// after balancing; fraction.
     pub lost_by_weakest: ScalarGaussian,
     /// The cell with the smallest capacity.
     pub weakest: CellIndex,
@@ -74,12 +75,13 @@ pub struct Imbalance {
 pub struct LimitingCell {
     /// Index of the cell.
     pub cell: CellIndex,
-    /// Reason that belongs to the larger of `by_charge` and `by_capacity`.
+    /// Reason why the cell limits the pack. It belongs to the larger of `by_charge` and `by_capacity`.
     pub reason: LimitReason,
-    /// Charge missing because of the cell's SOC, compared with the mean cell, fraction of the mean capacity. The cell
-    /// cannot deliver this charge (if it is empty first) or cannot accept it (if it is full first).
+    /// Charge that is missing because the cell's SOC differs from that of the mean cell, fraction of the mean capacity.
+    /// The cell that is empty first cannot deliver this charge, and the cell that is full first cannot accept it.
     pub by_charge: f64,
-    /// Charge missing because of the cell's capacity, compared with the mean cell, fraction of the mean capacity.
+    /// Charge that is missing because the cell's capacity is smaller than that of the mean cell, fraction of the mean
+    /// capacity.
     pub by_capacity: f64,
 }
 
@@ -265,7 +267,8 @@ fn imbalance(time: Timestamp, cells: &[ComparedCell], middle_ah: ScalarGaussian)
         mean: mean / mean_capacity,
         variance: variance / (mean_capacity * mean_capacity),
     };
-    // Charge missing at one end = missing capacity + excess charge at the other end.
+    // Compared with the mean cell: missing dischargeable charge = missing capacity + excess chargeable charge. The same
+    // holds with discharge and charge exchanged.
     let less = |it: &ComparedCell, other_end: fn(&ComparedCell) -> f64, charge| {
         let by_capacity = (mean_capacity - it.capacity()) / mean_capacity;
         let by_charge = (other_end(it) - mean(other_end)) / mean_capacity;
@@ -374,7 +377,8 @@ mod tests {
         assert_near(found.usable.mean, 0.95);
         assert_near(found.lost_by_imbalance.mean, 0.05);
         assert_near(found.lost_by_weakest.mean, 0.0);
-        // Errors of cell 3 and of the first full cell: SOC with weight 1, capacity with the weights 0.55 and 0.4.
+        // The variance comes from cell 3 and from the first full cell. The errors of their SOC have the weight 1, and
+        // the errors of their capacity have the weights 0.55 and 0.4.
         let expected: f64 = 2.0 * 0.003f64.powi(2) + (0.55f64.powi(2) + 0.4f64.powi(2)) * 0.006f64.powi(2);
         assert_near(found.usable.variance, expected);
         let LimitingCell { cell, reason, by_charge, by_capacity } = found.discharge_limit;

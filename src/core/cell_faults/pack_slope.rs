@@ -1,20 +1,22 @@
 //! Learns the slope of the open-circuit curve from the pack itself.
 //!
-//! In: per row (a few minutes of samples), the pack's middle voltage without its drop (V), the counted charge, and
-//! the cells' differences. Out: for each tenth of SOC, the true slope divided by the slope of the cell model. All
+//! In, per row (a few minutes of samples): the counted charge, the differences between the cells, and the middle
+//! voltage (V). The middle voltage is the voltage of the pack's middle cell; the voltage drop of the current is added
+//! to it. Out: for each tenth of the SOC range, a factor: the true slope divided by the slope of the cell model. All
 //! cells share these factors.
 //!
 //! The slope is learned while the cell model is derived from a label (chemistry and capacity). Such a curve can have
-//! half or twice the slope of the real curve. A constant difference in charge then looks like a difference that
-//! depends on the SOC. The comparison of cells would explain it by a bad contact or a lost capacity.
+//! half or twice the slope of the real curve. A constant difference in charge then looks like a difference that depends
+//! on the SOC. The comparison of cells would mistake this difference for a bad contact or a lost capacity.
 //!
 //! The pack shows its own slope in two ways:
 //! * From the middle voltage: its change, divided by the charge that moved.
 //! * From cells with different charge: their voltage differences grow and shrink with the slope. This gives only the
 //!   ratio of the slopes in two tenths, because the charge differences themselves are still being learned.
 //!
-//! The factor of a tenth is the slope from the cells, scaled so that it agrees with the middle voltage over all
-//! tenths. In a tenth without cells of different charge, it is the slope from the middle voltage.
+//! The factor of a tenth is the slope from the cells. The slopes from the cells are scaled so that their sum over the
+//! tenths agrees with the slopes from the middle voltage. In a tenth without cells of different charge, the factor is
+//! the slope from the middle voltage.
 
 use serde::{Deserialize, Serialize};
 
@@ -41,8 +43,8 @@ const FIRST_VARIANCE: f64 = 1.0;
 /// Minimum charge difference of a cell that is used, fraction. With smaller differences, offsets of the voltage
 /// channels would look like a slope.
 const LEAST_CHARGE: f64 = 0.005;
-/// Maximum part of one cell in the sum of the charge differences. With a larger part, a fault of this cell could look
-/// like a slope.
+/// Maximum contribution of one cell to the sum of the charge differences. If one cell contributed more, a fault of this
+/// cell could look like a slope.
 const MOST_OF_ONE: f64 = 1.0 / 3.0;
 /// Errors of the slope from the cells. `CELL_V`: error of each cell's voltage difference, equal in every row (V).
 /// `CELLS`: error of one row (fraction), because the charge differences are still being learned.
@@ -62,8 +64,8 @@ const DROP: f64 = 0.3;
 const SHARED: f64 = 3.0;
 /// Number of standard deviations above which the weight of a measurement is reduced (Huber).
 const HUBER: f64 = 3.0;
-/// Maximum number of rows by which [`PackSlope::factor`] multiplies the variance of a factor. Older rows hardly
-/// influence the filter of a cell.
+/// Maximum number by which [`PackSlope::factor`] multiplies the variance of a factor. That function multiplies by the
+/// number of rows in a tenth. The number is limited, because older rows hardly influence the filter of a cell.
 const MOST_ROWS: u32 = 200;
 
 /// Values of a row from which the slope is learned.
@@ -93,9 +95,9 @@ pub(super) struct PackSlope {
 struct Tenth {
     /// Factor from the middle voltage.
     of_middle: ScalarGaussian,
-    /// Logarithm of the cells' mean charge difference (fraction), computed from their voltages with the model's
-    /// slope. The charge difference computed in this way is proportional to the factor. `None` before the first row
-    /// with cells of different charge.
+    /// Logarithm of the cells' mean charge difference (fraction), computed from their voltage differences with the
+    /// model's slope. If the true slope is twice the model's slope, this computed difference doubles, so it is
+    /// proportional to the factor. `None` before the first row with cells of different charge.
     of_cells: Option<ScalarGaussian>,
     /// Number of rows in this tenth.
     rows: u32,
@@ -106,7 +108,7 @@ fn tenth(soc: f64) -> usize {
 }
 
 impl PackSlope {
-    /// Discards the recent rows, because charge may have moved unseen.
+    /// Discards the recent rows, because charge may have moved without being measured.
     pub(super) fn interrupt(&mut self) {
         self.recent.clear();
     }
@@ -185,9 +187,11 @@ impl PackSlope {
             below >= 0.5 * total
         });
         let squares: f64 = cells.iter().map(|(charge, _)| charge * charge).sum();
-        // The channels of the cells have the same offsets in every row.
+        // The offsets of the voltage channels are the same in every row, so this part of the error does not average
+        // out.
         let lasting = CELL_V * CELL_V / (slope_v * slope_v * squares);
-        // The mean charge cancels the unknown scale of the charge differences.
+        // `multiple` is relative to the charge differences, whose scale is unknown. Multiplying by the mean charge
+        // removes this scale.
         let measured = libm::log(median.map_or(0.0, |(_, multiple)| multiple * mean_charge));
         if measured.is_finite() && lasting <= FIRST_VARIANCE {
             let before = tenth.of_cells.unwrap_or(ScalarGaussian { mean: measured, variance: FIRST_VARIANCE });
@@ -197,8 +201,8 @@ impl PackSlope {
         }
     }
 
-    /// Factor that scales the slopes from the cells, so that their sum equals the sum of the slopes from the middle
-    /// voltage. `None` if no tenth has both slopes.
+    /// Factor by which the slopes from the cells are multiplied, so that their sum equals the sum of the slopes from
+    /// the middle voltage. Only tenths with both slopes count. `None` if there is no such tenth.
     fn scale(&self) -> Option<f64> {
         let seen = || {
             self.tenths.iter().filter_map(|tenth| Some((tenth.of_middle.mean, libm::exp(tenth.clear_of_cells()?.mean))))
@@ -265,8 +269,8 @@ mod tests {
         Label::usual(chemistry, 100.0).model().expect("a model")
     }
 
-    /// The slope after 30 rows at a SOC of 0.35 and 30 rows at 0.75. In these rows, the voltages of six cells differ
-    /// by 0.5 and 1.5 times the model's difference. No charge moves.
+    /// The slope after 30 rows at a SOC of 0.35 and 30 rows at 0.75. The voltages of six cells differ by 0.5 times the
+    /// model's difference at SOC 0.35, and by 1.5 times at 0.75. No charge moves.
     fn seen(model: &CellModel) -> PackSlope {
         let mut slope = PackSlope::default();
         for (soc, multiple) in [(0.35, 0.5), (0.75, 1.5)] {

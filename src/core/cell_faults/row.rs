@@ -4,8 +4,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::quantity::Timestamp;
 
-/// If a voltage is equal bit for bit although its drop has changed by more than `REPEATED_V` (V), it counts as
-/// repeated, not as read again. After `REPEATED_S` (s), it counts as read, because the channel may be frozen.
+/// Some loggers repeat a cell's last voltage until they read the cell again. A voltage counts as repeated if it equals
+/// the last voltage bit for bit although the ohmic drop has changed by more than `REPEATED_V` (V). After `REPEATED_S`
+/// (s), an equal voltage counts as read again, because then the channel may be frozen.
 const REPEATED_V: f64 = 0.005;
 const REPEATED_S: f64 = 30.0;
 
@@ -14,8 +15,8 @@ pub(super) struct CellSums {
     pub(super) count: u32,
     /// Number of voltages in the sum. Repeated voltages are not added.
     readings: u32,
-    /// Sum of the voltages. The cells are sampled at different times. Each voltage is therefore corrected by the mean
-    /// cell's ohmic drop at the current of the sample.
+    /// Sum of the voltages (V). The cells are sampled at different times, and so at different currents. The ohmic drop
+    /// of the mean cell at the current of the sample is therefore added to each voltage.
     voltage_v: f64,
     steps_a2: f64,
     /// Sum of the products of current step and voltage step between samples.

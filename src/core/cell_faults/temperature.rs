@@ -1,8 +1,9 @@
 //! Finds temperature sensors that do not follow the load because they are frozen or detached.
 //!
-//! In: per row (a few minutes of samples), the temperature at each cell and the median warming of the pack. Cells that
-//! share a sensor show the same temperature, so a faulty sensor appears as a fault of a range of cells. If the pack has
-//! only one or two sensors, a faulty sensor cannot be recognised.
+//! In: per row (a few minutes of samples), the temperature at each cell and the median warming of the pack. The warming
+//! is a temperature minus its slow mean. Cells that share a sensor show the same temperature, so a faulty sensor
+//! appears as a fault of a range of cells. If the pack has only one or two sensors, a faulty sensor cannot be
+//! recognised.
 
 use serde::{Deserialize, Serialize};
 

@@ -1,18 +1,18 @@
 //! Detects a thermal event: the voltage of a cell collapses, or a temperature rises faster than the current explains.
 //!
-//! In: readings of cell voltages (V) and temperatures (degrees C). The readings have not passed the plausibility
-//! checks, because a thermal runaway changes them faster than plausible. Out: for each cell, whether there is
-//! evidence of a thermal event.
+//! In: readings of cell voltages (V) and temperatures (degrees C), before the plausibility checks. (These checks reject
+//! fast changes, and a thermal runaway causes fast changes.) Out: for each cell, whether there is evidence of a thermal
+//! event.
 //!
 //! * **Collapse**: within half a minute, the voltage of a cell falls by the fraction [`FALL`]. It must also fall by
 //!   [`FALL`] more than the median of the other cells. At least [`LEAST_READINGS`] readings over [`LEAST_S`] show the
-//!   fall. The drop that the current explains is deducted. If a cell may be almost empty, it is not judged, because
-//!   its voltage can fall as fast. Two faults do not count: a broken sense wire, which raises the voltage of a
-//!   neighbour, and a dead channel, which repeats one value.
+//!   fall. The drop that the current explains is deducted. If a cell may be almost empty, it is not judged, because the
+//!   voltage of an empty cell can fall as fast. Two faults do not count: a broken sense wire, which raises the voltage
+//!   of a neighbour, and a dead channel, which repeats one value.
 //! * **Heating**: a temperature rises by [`RATE_C_PER_S`] for [`LEAST_S`], or within [`WINDOW_S`] by [`AHEAD_C`] more
 //!   than the median of the other sensors. The rise that the current explains is deducted. A second reading,
-//!   [`LEAST_S`] later, must confirm the rise. Of the sensor's cells, the finding names the cell whose voltage has
-//!   fallen most.
+//!   [`LEAST_S`] later, must confirm the rise. If the sensor measures several cells, the finding names the cell whose
+//!   voltage has fallen most.
 //!
 //! The first minute after a gap in the readings is not judged. [`FALL`], [`RATE_C_PER_S`] and [`LEAST_S`] are the
 //! limits at which GB 38031 (appendix C) confirms a thermal runaway.
@@ -60,7 +60,8 @@ const SETTLE_S: f64 = 60.0;
 /// If a temperature falls by more than this between two readings (degrees C) at more than this rate (degrees C/s),
 /// its sensor has failed. No cell cools so fast.
 const IMPOSSIBLE_FALL: (f64, f64) = (5.0, 0.5);
-/// Maximum time for which a failed sensor must exceed the temperature that it showed before the failure (s).
+/// After a failure of a sensor, only temperatures above the temperature before the failure count ([`Floor`]). This
+/// condition lasts at most this long (s).
 const FLOOR_S: f64 = 3600.0;
 /// Evidence lasts this long after the last reading that shows it (s).
 const HOLD_S: f64 = 60.0;
@@ -317,7 +318,7 @@ impl ThermalWatch {
         };
         let changes = own.references.iter().flatten().map(|reference| change(reference.rate_per_h));
         let explained_v = EXPLAINED_V * changes.fold(0.0, f64::max);
-        // A higher reference cannot be the voltage of the cell.
+        // If the reference is above this multiple of the median, it cannot have been the cell's true voltage.
         let share = (latest_v + explained_v) / reference_v.min(HIGHEST_SHARE * middle_v);
         let is_sound = |neighbour: &CellState| {
             let has_reported = neighbour.latest.is_some_and(|(at, _)| at >= fall.since);

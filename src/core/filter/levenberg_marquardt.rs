@@ -1,7 +1,7 @@
 //! Levenberg-Marquardt: finds the minimum of a cost with damped steps.
 //!
 //! The damping falls after a step that lowers the cost, and grows after any other step. The caller computes the step
-//! for a given damping, by any method (dense or bounded, with differences or derivatives).
+//! for a given damping.
 
 /// Damping, relative to the diagonal of the normal matrix.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -215,8 +215,8 @@ impl<const L: usize> Lanes<L> {
         )
     }
 
-    /// ln x for a normal, positive x. The error is at most two units in the last place of ln x, or of 1e-3 if |ln x| is
-    /// smaller.
+    /// ln x for a normal, positive x. The error is at most 2 x 2^-52 times |ln x|, or 2 x 2^-52 times 1e-3 if |ln x| is
+    /// smaller than 1e-3.
     #[inline(always)]
     pub fn ln(self) -> Self {
         Self(from_fn(|i| ln(self.0[i])))

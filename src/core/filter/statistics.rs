@@ -1,6 +1,7 @@
 //! Median, range and normal distribution, for numbers in any unit.
 
-/// Median of the finite values; of two middle values, the upper value. `None` without a finite value.
+/// Median of the finite values. If there are two middle values, the upper one is returned. `None` if no value is
+/// finite.
 pub fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
     // Allocate once, because collecting a filtered iterator would grow a small buffer repeatedly.
     let mut finite = Vec::with_capacity(values.size_hint().1.unwrap_or_default());

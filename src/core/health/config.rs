@@ -1,5 +1,5 @@
-//! Settings for learning at charge/discharge transitions. Each charge and each discharge is a half-cycle. The host's
-//! `config` module checks the ranges.
+//! Settings for what is learned whenever the pack changes between charge and discharge: capacity, recharge period,
+//! usable capacity. Each charge and each discharge is a half-cycle. The host's `config` module checks the ranges.
 
 use super::OutlookConfig;
 
@@ -49,9 +49,9 @@ pub struct CapacityConfig {
     /// Initial standard deviation of the current sensor's offset per cell (A); 0 = the offset is not learned. Not used
     /// by `Nominal`.
     pub current_offset_std_a: f64,
-    /// Initial standard deviation of the fade (Ah) per full cycle; 0 = the fade is not learned. Not used by `Nominal`.
+    /// Initial standard deviation of the fade (Ah per full cycle); 0 = the fade is not learned. Not used by `Nominal`.
     pub fade_std_ah_per_cycle: f64,
-    /// Process noise of the fade: standard deviation gained per equivalent full cycle (Ah) per full cycle.
+    /// Process noise of the fade: standard deviation (Ah per full cycle) gained per equivalent full cycle.
     pub fade_noise_ah_per_cycle: f64,
 }
 
@@ -93,7 +93,7 @@ pub struct UsableConfig {
     pub taper_current_a: f64,
 }
 
-/// Settings for learning at charge/discharge transitions.
+/// Settings for what is learned whenever the pack changes between charge and discharge.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct HealthConfig {
     pub transition: TransitionConfig,

@@ -1,14 +1,16 @@
-//! Computes how errors of the cell model at the start and end of a half-cycle change the learned capacity. Half-cycles
-//! between the same SOC values have the same errors, so these errors do not average out.
+//! Computes how errors of the cell model at the start and end of a half-cycle (one charge or discharge) change the
+//! learned capacity. All half-cycles between the same two SOC values have the same errors, so these errors do not
+//! average out.
 //!
 //! In: SOC at the start and end of a half-cycle. Out: change of the half-cycle's capacity (Ah) per standard deviation
 //! of each error.
 //!
-//! A half-cycle's capacity is charge / (s_high - s_low). An error e (V) of the open-circuit curve at one end changes
-//! the SOC at this end by e / slope, and the capacity by (C / swing) (e / slope). The errors are defined at SOC nodes.
-//! They are independent of each other and are interpolated linearly between the nodes. Their size is `end_error_v` of
-//! the settings or, by default, follows from the voltage error that the cell model states. If neither states an error,
-//! the errors are 0 here. The constant voltage offset of the cell's estimator then also covers errors of the curve.
+//! A half-cycle's capacity C is charge / swing, where the swing is the higher SOC minus the lower SOC. An error e (V)
+//! of the open-circuit curve at one end changes the SOC at this end by e / slope, and the capacity by (C / swing) (e /
+//! slope). The errors are defined at SOC nodes. They are independent of each other and are interpolated linearly
+//! between the nodes. Their size is the setting `end_error_v`. Without this setting, it follows from the voltage error
+//! that the cell model states. If the model states no error, the errors are 0 here. The constant voltage offset of the
+//! cell's estimator must then also cover the errors of the curve.
 
 use super::CapacityConfig;
 use super::half_cycle::HalfCycle;
@@ -22,7 +24,7 @@ pub(super) const END_ERRORS: usize = 5;
 
 /// Change of a half-cycle's capacity (Ah) per standard deviation of each error; zero if the SOC at the half-cycle's
 /// ends is unknown. `is_label`: whether the model comes from a label. If so, the whole uncertainty of the curve counts
-/// as an error that does not change.
+/// as an error that is the same in all half-cycles.
 pub(super) fn effects_ah(
     model: &CellModel,
     config: &CapacityConfig,
@@ -34,14 +36,14 @@ pub(super) fn effects_ah(
     let Some(ends) = &half_cycle.ends else { return effects };
     let bands = ModelBands::new(model);
     let temperature = model.temperature_position(half_cycle.mean_temperature_c.unwrap_or(CURVE_C));
-    // Below a swing of 2 %, the measurement is useless, so the effect is limited.
+    // A swing below 2 % gives no useful measurement. It counts as 2 %, so that the effect stays finite.
     let swing = (half_cycle.charge_ah / capacity_ah).max(0.02);
     // A discharge starts at its higher SOC, a charge at its lower SOC.
     let sign = if half_cycle.mode == Mode::Charge { -1.0 } else { 1.0 };
     for (soc, fuller) in ends.iter().zip([sign, -sign]) {
         let position = model.grid_position_at(&temperature, *soc);
-        // Half of the error stated by a fitted model is an error of the curve and does not change. The other half
-        // depends on the history of the current, so it differs between half-cycles.
+        // Half of the error that a fitted model states is an error of the curve, which is the same in all half-cycles.
+        // The other half depends on the history of the current, so it differs between half-cycles.
         let of_fit_v = || model.voltage_error_v(&position).map_or(0.0, |error_v| 0.5 * error_v);
         let of_label_v = || bands.curve_std_v(*soc).unwrap_or(0.0);
         let own_v = || if is_label { of_label_v() } else { of_fit_v() };
@@ -95,8 +97,8 @@ mod tests {
     fn curve_error_moves_capacity_by_slope_and_swing() {
         let model = small_model();
         let found = effects_ah(&model, &CONFIG, &discharge(0.9, 1.0, 0.375), 1.8, false);
-        // Slopes at 25 C, which is 5/8 of the way from 0 to 40 C: 1.075 V above SOC 0.5, 1.325 V below. The swing is
-        // 0.5.
+        // At 25 C (interpolated at 5/8 of the way from 0 to 40 C), the slope of the curve is 1.075 V per unit of SOC
+        // above SOC 0.5, and 1.325 V below. The swing is 0.5.
         let per_volt = 1.8 / 0.5 * 0.004;
         let lower = 0.5 * per_volt / 1.325;
         let expected = [0.0, lower, lower, 0.0, -per_volt / 1.075];

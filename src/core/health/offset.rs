@@ -1,13 +1,13 @@
 //! Learns the offset of the current sensor. All cells share this sensor.
 //!
 //! In: the evidence in the voltages of all cells ([`EstimatorBank::offset_evidence`]) and the elapsed time (s). Out:
-//! mean and standard deviation of the offset (A) per cell, measured minus true. The offset is best observed at rest,
-//! when the counted charge drifts but the voltage does not. Current readings of exactly zero are ignored, because a
-//! sensor that reads exactly zero suppresses small currents.
+//! mean and standard deviation of the offset in the current of one cell (A), measured minus true. The offset is best
+//! observed at rest, when the counted charge drifts but the voltage does not. Current readings of exactly zero are
+//! ignored, because a sensor that reads exactly zero suppresses small currents.
 //!
-//! Source: Friedland (1969), separate estimation of a bias: the innovations of a filter that ignores the bias are used
-//! to estimate the bias. Deviation: here the filter considers the bias in its gain, and the correction is applied only
-//! when the mode changes.
+//! Source: Friedland (1969), separate estimation of a bias. There, a filter ignores the bias, and its innovations are
+//! used to estimate the bias. In packwatch, the filter considers the bias in its gain, and the correction is applied
+//! only when the mode (charge, rest, discharge) changes.
 //!
 //! [`EstimatorBank::offset_evidence`]: crate::cell::EstimatorBank::offset_evidence
 
@@ -20,7 +20,7 @@ use crate::quantity::InvalidState;
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CurrentOffset {
-    /// Mean (A) per cell; subtracted from the current.
+    /// Mean of the offset in the current of one cell (A). It is subtracted from that current.
     mean_a: f64,
     /// Standard deviation as a fraction of the configured standard deviation. `None` = no offset has been learned; the
     /// fraction is then 1.
@@ -28,17 +28,17 @@ pub struct CurrentOffset {
 }
 
 impl CurrentOffset {
-    /// Mean (A) per cell.
+    /// Mean of the offset in the current of one cell (A).
     pub fn mean_a(&self) -> f64 {
         self.mean_a
     }
 
-    /// Standard deviation (A) per cell; `configured_a` if there has been no evidence.
+    /// Standard deviation of the offset (A); `configured_a` if there has been no evidence.
     pub fn std_a(&self, configured_a: f64) -> f64 {
         self.part() * configured_a
     }
 
-    /// The learned offset (A) per cell; `None` if there has been no evidence or learning is off (`configured_a` is 0).
+    /// The learned offset (A); `None` if there has been no evidence or learning is off (`configured_a` is 0).
     pub fn learned(&self, configured_a: f64) -> Option<ScalarGaussian> {
         let part = self.part.filter(|_| configured_a > 0.0)?;
         Some(ScalarGaussian::from_std(self.mean_a, part * configured_a))
@@ -48,8 +48,8 @@ impl CurrentOffset {
         self.part.unwrap_or(1.0)
     }
 
-    /// Updates with the evidence. For each innovation, d is the effect of one standard deviation of the offset, and R
-    /// is the variance of the innovation. `information` is the sum of d^2 / R over the innovations; `score` is the sum
+    /// Updates the offset with the evidence. For each innovation, d is its change if the offset grows by one standard
+    /// deviation, and R is its variance. `information` is the sum of d^2 / R over the innovations; `score` is the sum
     /// of d x innovation / R. Returns the correction in units of the standard deviation before the update.
     pub fn update(&mut self, configured_a: f64, (information, score): (f64, f64)) -> f64 {
         let std_a = self.std_a(configured_a);

@@ -34,7 +34,8 @@ const LEAST_MEAN: f64 = 0.1;
 /// Standard deviation of ln(future load over recent load): a driver needs a third more or less in the next half hour.
 const LOG_LOAD_STD: f64 = 0.3;
 /// Time over which the current of a charge is averaged (s). A charger regulates its current. Braking ends sooner, so a
-/// charge counts only after this time. If the gap between two currents is longer, it is not averaged.
+/// charge counts only after this time. If more time than this lies between two currents, the later current is not
+/// averaged.
 const CHARGER_S: f64 = 60.0;
 /// Number of halvings in a search for a SOC, for a resolution of 0.02 %.
 const HALVINGS: u32 = 12;
@@ -56,9 +57,9 @@ pub struct OutlookConfig {
     pub max_discharge_a: Option<f64>,
     /// Largest current of a charge (A); `None` = only the voltages limit it.
     pub max_charge_a: Option<f64>,
-    /// Lowest temperature (degrees C); `None` = no limit. Only the record of use applies it.
+    /// Lowest permitted temperature (degrees C); `None` = no limit. Only the record of the pack's use applies it.
     pub min_temperature_c: Option<f64>,
-    /// Highest temperature (degrees C); `None` = no limit. Only the record of use applies it.
+    /// Highest permitted temperature (degrees C); `None` = no limit. Only the record of the pack's use applies it.
     pub max_temperature_c: Option<f64>,
     /// A charge is complete when its current has fallen to this value (A).
     pub taper_current_a: f64,
@@ -439,7 +440,7 @@ pub fn of_pack(
     let sum = |value: &dyn Fn(&CellNow<'_>) -> f64| {
         pack.strings * pack.series_per_state * cells.iter().map(value).sum::<f64>()
     };
-    // The errors of all cells count as equal, because the cells share the current sensor and the model.
+    // The errors of all cells are assumed to be equal, because the cells share the current sensor and the model.
     let whole = |one: ScalarGaussian, value: &dyn Fn(&CellNow<'_>) -> f64| ScalarGaussian {
         mean: sum(value),
         variance: square(sum(&|_| 1.0)) * one.variance,

@@ -10,14 +10,15 @@
 //! Normalised: the time that a reference charger would need for the same window of the same pack:
 //! `t = 3600 (to - from) C / I_ref`.
 //! C is the pack's capacity (Ah), learned up to the end of this charge; I_ref is the reference current per cell (A).
-//! The standard deviation of t is the standard deviation of C times the same factor. It therefore includes the gain
-//! error of the current sensor.
+//! The standard deviation of t is the standard deviation of C times the same factor. The standard deviation of C
+//! includes the gain error of the current sensor, so that of t does, too.
 //!
-//! Reason for C instead of the charge moved within the window: the estimated SOC moves by the charge divided by the
-//! assumed capacity. The charge moved within the window is therefore the width of the window times the assumed
-//! capacity, corrected only by the voltages within the window. C uses these voltages and all earlier voltages, weighted
-//! by their information. Over the fleet of `tests/recharge_fleet.rs`, the RMS error is 0.57 % with C and 0.78 % with
-//! the charge moved. C also has a standard deviation, and does not require a charge that covers the whole window.
+//! The formula uses C and not the charge moved within the window. Reason: the filter changes the estimated SOC by the
+//! charge divided by the assumed capacity. The charge moved within the window is therefore the width of the window
+//! times the assumed capacity, corrected only by the voltages within the window. C uses these voltages and all earlier
+//! voltages, weighted by their information. Over the fleet of `tests/recharge_fleet.rs`, the RMS error is 0.57 % with C
+//! and 0.78 % with the charge moved. C also has a standard deviation, and does not require a charge that covers the
+//! whole window.
 //!
 //! Assumed: the reference charger holds its current over the whole window, so resistance, temperature and tapering have
 //! no effect. C is the capacity between the open-circuit voltages of the full and the empty cell at the model's

@@ -1,14 +1,15 @@
 //! Finds the largest changes of the charge, across several half-cycles.
 //!
-//! In: marks, which are copies of all totals at the ends of modes. Out: pairs of marks between which a large charge has
-//! moved in one direction.
+//! In: marks. A mark is a copy of all totals, made when a mode (charge, discharge, rest or unknown) ends. Out: pairs of
+//! marks between which a large charge has moved in one direction.
 //!
 //! A single half-cycle is often too small to measure the capacity. For example, a car discharges in several trips, and
-//! clouds interrupt the charge of a boat. A *span* lasts from one turning point of the counted charge to the next. A
-//! small change in the other direction does not end a span.
+//! clouds interrupt the solar charging of a boat. A *span* lasts from one turning point of the counted charge to the
+//! next. A small change in the other direction does not end a span.
 //!
-//! While no current was measured, the cells may have been charged or used. If the SOC by voltage has changed by more
-//! than [`JUMP`], the span starts again. Otherwise, the charge that may have flowed is part of the span's error.
+//! While no current was measured, the cells may have been charged or used. If the SOC computed from the voltages (SOC
+//! by voltage) has changed by more than [`JUMP`] in such a time, the span starts again. Otherwise, the charge that may
+//! have flowed is part of the span's error.
 
 use serde::{Deserialize, Serialize};
 
@@ -20,14 +21,15 @@ use crate::cell::{CellModel, reach_of_error};
 use crate::filter::{Measurement, square};
 use crate::quantity::{InvalidState, Mode};
 
-/// Smallest span, as a part of the rated capacity. Smaller spans show mostly the error of a label's curve.
+/// Smallest span, as a part of the rated capacity. If the open-circuit curve is derived from a label, its error
+/// dominates in smaller spans.
 const LEAST: f64 = 0.25;
 
 /// Smallest charge in the other direction that ends a span, as a part of the rated capacity.
 const TURN: f64 = 0.05;
 
-/// Change of the SOC by voltage (fraction) that shows a charge or a discharge while no current was measured. The
-/// difference between a voltage after a load and a voltage after a rest causes a smaller change.
+/// Change of the SOC by voltage (fraction) that shows a charge or a discharge while no current was measured. If a cell
+/// only relaxes after a load, its SOC by voltage changes less.
 const JUMP: f64 = 0.08;
 
 /// Standard deviation of the charge that may have flowed unnoticed while no current was measured, as a part of the
@@ -42,7 +44,7 @@ pub(super) struct Span {
     /// The mark with the largest change of the charge since the start.
     turn: Option<Mark>,
     last: Option<Mark>,
-    /// Number of periods without a measured current: since the start, and up to the turn.
+    /// Numbers of periods without a measured current: from the start until now, and from the start to the turn.
     gaps: [u32; 2],
     /// Start and end of the last complete span that no cell has learned from yet, and the number of its gaps.
     pub(super) closed: Option<(Mark, Mark, u32)>,
@@ -69,6 +71,7 @@ impl Span {
         let (moved, most) = (part(start, now), part(start, turn));
         let is_still_last = turn.time == last.time && matches!(from, Mode::Rest | Mode::Unknown);
         if is_still_last || moved * most >= most * most {
+            // The turn moves to this mark, because the charge has moved further or the cell has rested at the turn.
             // After a rest, the voltage shows the SOC better than before.
             (self.turn, self.gaps[1]) = (Some(now.clone()), self.gaps[0]);
         } else if part(turn, now).abs() >= TURN {
@@ -203,7 +206,7 @@ mod tests {
     #[test]
     fn unseen_use_restarts_span() {
         let mut span = Span::default();
-        // In the third mark, a charge of 0.3 has moved while no current was measured.
+        // Before the third mark, the SOC by voltage falls by 0.3 while no current is measured.
         let trips = [
             (Mode::Unknown, [0.0, 0.9]),
             (Mode::Discharge, [0.2, 0.7]),

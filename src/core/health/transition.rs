@@ -55,8 +55,8 @@ impl TransitionDetector {
         let mut candidate_begins = false;
         self.candidate = match self.candidate {
             _ if observed == self.mode => None,
-            // If the current becomes stale soon after a load ends, rest and unknown mode count as one change, dated at
-            // the end of the load.
+            // If the current becomes stale soon after a load ends, rest and unknown mode count as the same candidate,
+            // which began at the end of the load.
             Some(before) if before.mode == observed || (idle(before.mode) && idle(observed)) => {
                 Some(ModeCandidate { mode: observed, since: before.since })
             }

@@ -6,8 +6,8 @@
 //!
 //! The discharge is simulated with the circuit's equations at constant current until the voltage falls to the cut-off.
 //! The simulation starts from the SOC after a full charge, with relaxed RC branches. The variance is propagated to
-//! first order from three quantities: the capacity, ln rho (rho is the resistance ratio), and the slow ratio
-//! (additional resistance ratio of the slowest branch). Capacity and ln rho are correlated.
+//! first order from three quantities: the capacity, ln rho (rho is the cell's resistance relative to the model), and
+//! the slow ratio (additional resistance ratio of the slowest branch). Capacity and ln rho are correlated.
 
 use super::UsableConfig;
 use crate::cell::circuit::{BranchAt, aged_terminal_v, soc_after};

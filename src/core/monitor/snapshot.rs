@@ -27,10 +27,10 @@ use crate::sample::{CellSample, SampleConfig};
 
 /// Name of the charge that [`Snapshot::check_charges`] checks, for error messages.
 const CHARGE: &str = "the charge since a cell's latest voltage or half-cycle";
-/// Factor by which a charge may exceed the largest plausible charge. The limits of the current may have been wider when
-/// the charge was counted.
+/// Factor by which a charge may exceed the largest plausible charge, because the configured limits of the current may
+/// have been wider when the charge was counted.
 const CHARGE_TOLERANCE: f64 = 2.0;
-/// Tolerance of the time during which a charge has moved (s). The clock may have been set in this time.
+/// Tolerance of the time during which a charge has moved (s), because the clock may have been set in this time.
 const CHARGE_TOLERANCE_S: f64 = 1000.0;
 
 pub(crate) const SNAPSHOT_VERSION: u32 = 1;
@@ -56,7 +56,7 @@ pub struct Snapshot {
     pub(crate) learning: LearningState,
     /// State of the cell-fault detector; `None` if the pack is too small for a comparison.
     pub(crate) diagnosis: Option<CellFaultDetector>,
-    /// State of the thermal-event detector; `None` without its rule, and in a state for a restart.
+    /// State of the thermal-event detector; `None` if its alarm rule is not configured, and in a state for a restart.
     pub(crate) thermal: Option<ThermalWatch>,
     pub(crate) alarming: StoredAlarming,
     pub(crate) sending: SendingState,
@@ -179,8 +179,8 @@ impl Snapshot {
         self.sampling.sampler.wiring()
     }
 
-    /// State of the cell model. `label`: the configured label, which is used if the stored state has no fit. `None` if
-    /// the model comes from a model file, or if the label is unknown.
+    /// State of the cell model. If the stored state contains no fitted model, the configured `label` is used. Returns
+    /// `None` if the model comes from a model file, or if the label is unknown.
     ///
     /// # Errors
     /// The first number that is out of range.
@@ -190,8 +190,8 @@ impl Snapshot {
         Ok(stored.stored_view(label))
     }
 
-    /// Whether the waiting samples fit the snapshot: each cell has at most one waiting sample, and every cell with a
-    /// waiting sample exists and has reported in the unfinished batch.
+    /// Whether the samples of the unfinished batch (waiting samples) fit the snapshot: each cell has at most one
+    /// waiting sample, and every cell with a waiting sample exists and is marked as updated in this batch.
     pub(crate) fn waiting_fits(&self) -> bool {
         let mut has_come: Vec<bool> = self.cells.iter().map(|cell| cell.updated_in_round).collect();
         let mut is_first = |cell: usize| has_come.get_mut(cell).is_some_and(std::mem::take);
@@ -210,7 +210,7 @@ impl Snapshot {
         self.sampling.sampler.check()?;
         self.intake.commands.check_state()?;
         self.packs.check()?;
-        // The limit on timestamps prevents overflow of their differences.
+        // The limit on the time prevents an overflow when two times are subtracted.
         bounds::STAMP_NS.check("the time of the state, ns", self.time.nanos() as f64)?;
         Ok(self.learning.check()?)
     }
@@ -221,8 +221,8 @@ impl Snapshot {
     pub(crate) fn check_charges(&self, config: &SampleConfig) -> Result<(), RestoreError> {
         let (strings, limits) = (f64::from(config.strings.max(1)), &config.current);
         let most_a = limits.min.abs().max(limits.max.abs()) / strings;
-        // The charge stored with a cell's latest voltage assumes that the latest current reading lasted until that
-        // voltage. Count in the same way up to the time of the state.
+        // The charge that is stored with a cell's latest voltage was counted as if the latest current had flowed until
+        // that voltage. Count in the same way up to the time of the state.
         let charge_as = self.sampling.sampler.charge_as(self.time, limits.max_age_s) / strings;
         let check = |time: Timestamp, before_as: f64| {
             // The sampler may have held a current for `max_age_s` before the next reading replaced it.

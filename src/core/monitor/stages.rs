@@ -177,7 +177,8 @@ impl Stages {
     }
 
     /// Runs the filters on the waiting samples, without waiting for the other cells. Callers do this before they use
-    /// estimates. If the samples are not recent (`is_current` is false), the rule on innovations does not judge them.
+    /// estimates. If the samples are not recent (`is_current` is false), the alarm rule that judges the innovations
+    /// (measured minus predicted voltages) ignores them.
     pub(crate) fn step_waiting(&mut self, now: Timestamp, is_current: bool, out: &mut Outputs) {
         if self.estimation.batch.waiting.is_empty() {
             return;
@@ -219,8 +220,8 @@ impl Stages {
         self.estimation.estimate(index, self.learning.capacity(index))
     }
 
-    /// Passes the pack current (`None` if stale) to the mode detector. When the mode changes, the learning stage
-    /// evaluates the mode that ended.
+    /// Passes the pack current (`None` if stale) to the mode detector (charge, discharge or rest). When the mode
+    /// changes, the learning stage evaluates the period that has ended.
     fn observe_current(&mut self, now: Timestamp, current_a: Option<f64>, out: &mut Outputs) {
         let Learning { config, state, .. } = &mut self.learning;
         let observed = state.detector.observe(&config.transition, now, current_a);
@@ -278,8 +279,8 @@ impl Stages {
         }
     }
 
-    /// Passes the capacities of all cells to the capacity rules, except cells in modules of another kind. Called when a
-    /// new model has changed the capacities.
+    /// Passes the capacities of the cells to the capacity rules. Called when a new model has changed the capacities.
+    /// Cells in modules with other cells have their own model and are skipped.
     fn restate_capacities(&mut self, now: Timestamp, out: &mut Outputs) {
         for index in self.estimation.bank.own_cells().to_vec() {
             let capacity = self.learning.learned_capacity(index);
@@ -306,7 +307,8 @@ impl Stages {
     ) -> CommandOutcome {
         self.step_waiting(now, true, out);
         if command == Command::PackReplaced {
-            // Learned values that were put aside belong to the old pack, so drop them regardless of the pack number.
+            // Learned values that were put aside when a reading showed another pack number belong to the old pack. Drop
+            // them, whatever the pack number is now.
             self.packs.drop_aside();
         }
         let CommandOutcome { changed, refused } = match command {
@@ -426,7 +428,8 @@ impl Stages {
             }
         }
         if !self.sampling.sampler.voltages_fresh(now) {
-            // A cell without a fresh voltage may be the cell that limits the pack.
+            // The pack's values are unknown, because a cell without a fresh voltage may be the cell that limits the
+            // pack.
             self.forget_pack_state();
         }
         let is_current_frozen = self.sampling.sampler.is_current_frozen();

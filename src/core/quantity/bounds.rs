@@ -91,7 +91,7 @@ pub const STAMP_NS: Bounds = Bounds::new(-4.6e18, 4.6e18, "within 145 years of t
 /// Any number without a more specific bound. Its square and its cube do not overflow.
 pub const NUMBER: Bounds = Bounds::new(-1e20, 1e20, "at most 1e20 in size");
 
-/// Variance of any quantity. The caller can divide by its square.
+/// Variance of any quantity. The lower bound is so large that its square does not underflow to 0.
 pub const VARIANCE: Bounds = Bounds::new(1e-150, 1e20, "1e-150 to 1e20");
 
 /// Configured standard deviation or noise density of any quantity.
@@ -100,7 +100,7 @@ pub const DEVIATION: Bounds = Bounds::new(0.0, 1e3, "0 to 1000");
 /// Standard deviation of a voltage sensor's noise (V). No converter is better than the lower bound.
 pub const VOLTAGE_NOISE_V: Bounds = Bounds::new(1e-6, 10.0, "1e-6 to 10 V");
 
-/// Spread of the sigma points. With a smaller spread, the differences between the points are lost in rounding.
+/// Spread of the sigma points. Below the lower bound, the differences between the points are lost in rounding.
 pub const SIGMA_POINT_SPREAD: Bounds = Bounds::new(1e-3, 1.0, "0.001 to 1");
 
 #[cfg(test)]

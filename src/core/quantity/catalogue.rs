@@ -130,7 +130,7 @@ pub struct QuantityRow {
     /// JSON key and column name of the standard deviation.
     pub std_key: Option<&'static str>,
     pub unit: Unit,
-    /// Without prefix and unit.
+    /// Name in metrics, without prefix and unit.
     pub metric: &'static str,
     /// `None` = only cells have this quantity.
     pub pack: Option<Presentation>,

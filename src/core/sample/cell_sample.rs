@@ -1,5 +1,5 @@
-//! Defines [`CellSample`], the input of a cell's estimator, and [`Moment`], which voltages that were measured together
-//! share.
+//! Defines [`CellSample`], the input of a cell's estimator, and [`Moment`], the current and the counters at one time,
+//! which all voltages measured at this time share.
 //!
 //! A sample contains a voltage (V), the fresh current (A) and temperature (degrees C), and the charge counted up to the
 //! time of the voltage (As).
@@ -18,10 +18,11 @@ pub struct CellSample {
     pub voltage_v: f64,
     /// Positive = discharge; `None` = the last good reading is too old.
     pub current_a: Option<f64>,
-    /// Cumulative charge taken out of the cell; only differences are meaningful. Later readings may correct the charge
-    /// counted after the last current reading.
+    /// Cumulative charge taken out of the cell; only differences are meaningful. The charge after the last current
+    /// reading is extrapolated, and later readings may correct it.
     pub charge_as: f64,
-    /// Cumulative time in which the current reading was not exactly zero.
+    /// Cumulative time in which the sensor's offset acts on the charge, because the current reading was not exactly
+    /// zero.
     pub offset_s: f64,
     /// Cumulative time without a usable current.
     pub unmeasured_s: f64,

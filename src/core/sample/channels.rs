@@ -1,4 +1,5 @@
-//! Lists the channels in use, and selects the configured [`Limits`] of each channel and the clock of its stuck check.
+//! Lists the channels in use. For each channel, selects the configured [`Limits`] and the clock that decides whether
+//! the reading is stuck.
 
 use super::charge::ChargeTotals;
 use super::config::{Limits, SampleConfig, VoltageSource};
@@ -36,9 +37,9 @@ pub(super) fn channels(config: &SampleConfig, sensors: usize) -> Vec<Channel> {
     channels
 }
 
-/// Clock of the stuck check: cumulative time (s) in which the signal should have changed. For a voltage, only discharge
-/// counts, because a charger may hold the voltage constant. Temperature and current should change whenever current
-/// flows.
+/// Cumulative time (s) in which the signal should have changed. If the reading stays the same for too long by this
+/// clock, it is stuck. For a voltage, only discharge counts, because a charger may hold the voltage constant.
+/// Temperature and current should change whenever current flows.
 pub(super) fn should_move_s(channel: Channel, totals: &ChargeTotals) -> f64 {
     match channel {
         Channel::Current | Channel::Temperature(_) => totals.flowing_s,

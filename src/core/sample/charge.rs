@@ -24,13 +24,13 @@ const SHORT_GAP: f64 = 4.0;
 /// Cumulative charge and unmeasured time at one moment.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct ChargeTotals {
-    /// Taken out of the pack.
+    /// Charge taken out of the pack.
     pub charge_as: f64,
     /// Time in which the reading was not exactly zero and therefore included the sensor's offset.
     pub offset_s: f64,
     /// Time without a usable current.
     pub unmeasured_s: f64,
-    /// In either direction.
+    /// Time in which current flowed, in either direction.
     pub(super) flowing_s: f64,
     pub(super) discharging_s: f64,
 }
@@ -97,7 +97,8 @@ impl ChargeCounter {
         self.open_until.is_some_and(|until| now <= until)
     }
 
-    /// No current flows from `time` to `until`, unless the contactors close earlier.
+    /// Notes that the contactors are open: no current flows from `time` to `until`, unless the contactors close
+    /// earlier.
     pub(super) fn open(&mut self, time: Timestamp, until: Timestamp, max_age_s: f64) {
         self.hold(time, Some(0.0), max_age_s);
         self.open_until = Some(until);
@@ -118,7 +119,7 @@ impl ChargeCounter {
         self.current_a = current_a;
     }
 
-    /// `max_age_s`, or longer while the contactors are open.
+    /// Longest time for which the present current is held: `max_age_s`, or longer while the contactors are open.
     #[inline]
     fn hold_s(&self, max_age_s: f64) -> f64 {
         match (self.open_until, self.counted_to) {

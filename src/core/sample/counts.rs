@@ -19,12 +19,12 @@ pub struct ReadingCounts {
     pub out_of_range: u64,
     pub rate_too_high: u64,
     pub stuck: u64,
-    /// How often a signal became too old.
+    /// How often the latest reading of a signal became too old.
     pub stale: u64,
 }
 
 impl ReadingCounts {
-    /// Readings that were not used although their sender stated a value.
+    /// Refused readings: rejected although their sender stated a value (unlike "not available").
     pub fn refused(&self) -> u64 {
         self.refusals().iter().map(|(count, _)| count).sum()
     }

@@ -26,11 +26,11 @@ const MIN_FROZEN_S: f64 = 5.0;
 /// Longest time from an extreme voltage to the turn (s). The voltages of cells that rest, cool or balance turn more
 /// slowly.
 const MAX_TURN_S: f64 = 60.0;
-/// Step in configured standard deviations of a voltage's noise.
+/// The step is at least this multiple of the configured standard deviation of a voltage's noise.
 const STEP_SIGMA: f64 = 5.0;
-/// Step as a multiple of the median change from round to round, for noise beyond the configured noise. The multiple
-/// corresponds to 8 standard deviations, so that two consecutive readings do not exceed the step by chance within a
-/// day.
+/// The step is also at least this multiple of the median change from round to round, because the noise may exceed the
+/// configured noise. The multiple corresponds to 8 standard deviations, so that two consecutive readings do not exceed
+/// the step by chance within a day.
 const STEP_MOVES: f64 = 8.4;
 /// Maximum and minimum number of changes from which the median change is calculated.
 const MAX_MOVES: usize = 32;
@@ -52,7 +52,7 @@ struct Reversals {
     range_v: Option<(f64, f64)>,
     /// Whether the voltage has risen since the last turning point; `None` = no turning point yet.
     is_rising: Option<bool>,
-    /// When the voltage had its extreme.
+    /// Time of the extreme (highest or lowest) voltage since the last turning point.
     extreme_at: Timestamp,
     /// Whether the next reading must confirm a turn.
     is_unconfirmed: bool,
@@ -163,7 +163,8 @@ impl FrozenCheck {
     fn end_round(&mut self, now: Timestamp, step_v: f64) {
         self.round_v.sort_unstable_by(f64::total_cmp);
         let cells = self.round_v.len();
-        // Take the middle cell that changed less, because a load moves both middle cells.
+        // With an even number of cells there are two middle cells. Take the one that changed less: a load moves both, a
+        // glitch only one.
         let (low, high) = (self.round_v[(cells - 1) / 2], self.round_v[cells / 2]);
         let is_low_nearer = (low - self.median_v).abs() <= (high - self.median_v).abs();
         let median = if is_low_nearer { low } else { high };

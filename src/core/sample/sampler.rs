@@ -22,8 +22,8 @@ pub use inputs::SensorRange;
 
 use crate::quantity::{CellIndex, Channel, Fault, InvalidState, Reading, SensorIndex, Timestamp};
 
-/// Smallest current that counts as flowing, as a fraction of the largest plausible current. It is above a sensor's
-/// noise and offset, and below any load under which a voltage or temperature must change.
+/// Smallest current that counts as flowing, as a fraction of the largest plausible current. It is larger than a
+/// sensor's noise and offset. It is smaller than any load under which a voltage or temperature must change.
 pub const FLOW_SHARE: f64 = 0.01;
 
 /// Reports that a signal turned bad (with the fault) or good again (with the number of preceding bad readings).
@@ -215,7 +215,7 @@ impl Sampler {
         self.state.frozen.is_frozen()
     }
 
-    /// Change of the pack current that exceeds the sensor's noise (A).
+    /// Smallest change of the pack current that is larger than the sensor's noise (A).
     pub fn flow_a(&self) -> f64 {
         self.flow_a
     }
@@ -279,7 +279,8 @@ impl Sampler {
         (self.next_stale, self.shared.is_known) = (None, false);
     }
 
-    /// Handles the end of a sleep. Values keep their age, but the time asleep does not make a signal silent or stale.
+    /// Handles the end of a sleep. Values keep their age, so values from before the sleep are not used as fresh. But a
+    /// signal is reported as silent or stale only if it sends no new value for its maximum age after `time`.
     pub fn wake(&mut self, time: Timestamp) {
         self.state.began = Some(time);
         self.next_stale = None;
@@ -341,7 +342,7 @@ impl Sampler {
         (self.next_stale, self.shared.is_known) = (None, false);
     }
 
-    /// Current and counters, for voltages that are measured at `now` and arrive later.
+    /// Returns the current and the counters at `now`, for voltages that were measured at `now` but arrive later.
     pub fn moment(&mut self, now: Timestamp) -> Moment {
         let time = self.advance(now);
         self.refresh_shared_inputs(time);
@@ -430,7 +431,7 @@ impl Sampler {
             }
             (Channel::PackVoltage, VoltageSource::Cells)
             | (Channel::CellVoltage(_), VoltageSource::PackTotal { .. })
-            // The monitor uses these channels, which are not sampled.
+            // The monitor itself uses these channels. They do not become part of a sample.
             | (Channel::SupplyVoltage | Channel::Balancing(_) | Channel::PackIdentity, _) => None,
             (Channel::ReportedSoc | Channel::ReportedSoh | Channel::CurrentDirection | Channel::Contactor, _) => {
                 let first = voltage + self.voltages;

@@ -4,14 +4,14 @@
 //! between good and bad.
 //!
 //! * **Range**: a value outside the limits is bad.
-//! * **Rate**: a value is bad if its distance from the last good value exceeds the fastest plausible change. If
-//!   [`ACCEPT_AFTER`] consecutive readings agree with each other, the last of them is accepted, because the step was
-//!   real or the last good value was wrong. Further rejection would lock out a healthy sensor.
+//! * **Rate**: a value is bad if it differs from the last good value by more than the fastest plausible change. If
+//!   [`ACCEPT_AFTER`] consecutive readings agree with each other, the last of them is accepted. Either the step was
+//!   real or the last good value was wrong, and further rejection would lock out a healthy sensor.
 //! * **Stuck**: a value that stays exactly the same for too long while it should change is bad until it changes. The
 //!   caller passes a clock that runs only while the value should change.
 //! * **Stale**: the last good value is older than the maximum age.
 //!
-//! A fault found by the decoder is passed on.
+//! If the decoder has already found a fault, this fault becomes the outcome.
 
 use serde::{Deserialize, Serialize};
 
@@ -19,14 +19,15 @@ use super::config::Limits;
 use crate::quantity::bounds;
 use crate::quantity::{Fault, InvalidState, Timestamp};
 
-/// Readings that must agree on a new level. A single disturbance could cause two.
+/// Number of consecutive readings that must agree before a new level is accepted. One disturbance can cause two wrong
+/// readings.
 pub const ACCEPT_AFTER: u32 = 3;
 
 /// Shortest interval for the rate check (s). Time stamps of consecutive frames jitter by about this much, and the rate
 /// in an interval of zero would be infinite.
 pub const MIN_RATE_INTERVAL_S: f64 = 1e-3;
 
-/// After this number of further readings, a reading has lost most of its weight in the share of bad readings.
+/// The share of bad readings is a moving average over about this number of readings.
 pub const BAD_SHARE_READINGS: u32 = 100;
 
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -48,7 +49,7 @@ pub(super) struct Signal {
     refused: Option<TimedValue>,
     /// Consecutive readings that agree with `refused`.
     refused_count: u32,
-    /// Unchanged since the stuck clock showed `rests_since_s`.
+    /// Latest value. It has not changed since the clock of the stuck check showed `rests_since_s`.
     rests_at: Option<f64>,
     rests_since_s: f64,
     /// Time of the latest reading, good or bad.
@@ -62,8 +63,8 @@ pub(super) struct Signal {
     bad_share: f64,
 }
 
-/// Outcome of a reading: the checked value, and the new state if it changed. `Ok` contains the number of preceding bad
-/// readings.
+/// Outcome of a reading: the checked value, and the new state of the signal if it changed. If the signal became good,
+/// `change` contains the number of preceding bad readings.
 pub(super) struct SignalUpdate {
     pub(super) value: Result<f64, Fault>,
     pub(super) change: Option<Result<u64, Fault>>,
@@ -72,7 +73,7 @@ pub(super) struct SignalUpdate {
 }
 
 impl Signal {
-    /// Checks a reading. `should_move_s` is the clock of the stuck check.
+    /// Checks a reading. `should_move_s` is the time on the clock of the stuck check (s).
     #[inline]
     pub(super) fn handle(
         &mut self,
@@ -98,7 +99,8 @@ impl Signal {
         Fault::Stale
     }
 
-    /// Earliest time at which the signal is stale. Its age does not start before `began`.
+    /// Earliest time at which the signal is stale. The age of the signal counts from its last good value, but not from
+    /// before `began`.
     pub(super) fn stale_from(&self, began: Timestamp, limits: &Limits) -> Timestamp {
         self.good.map_or(began, |good| good.time.max(began)).plus_secs(limits.max_age_s)
     }

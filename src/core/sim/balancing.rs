@@ -1,4 +1,5 @@
-//! Simulates passive balancing: the BMS bleeds cells whose voltage is above the lowest cell voltage.
+//! Simulates passive balancing: the BMS bleeds (discharges through a resistor) the cells whose voltage is above the
+//! lowest cell voltage.
 //!
 //! The BMS bleeds cells near the end of a charge and during the first rest after the charge, even while the buses
 //! sleep. If the car drives before this rest, balancing pauses during the drive. The BMS compares the voltages that its
@@ -41,8 +42,8 @@ impl Balancer {
         Self { settings, charging_s: 0.0, is_armed: false, has_rested: false }
     }
 
-    /// Switches the resistors for the next step, after `dt_s` seconds with `current_a`. `offset_v` returns a channel's
-    /// offset (V).
+    /// Switches the resistors for the next step. The last step had `dt_s` seconds with the current `current_a`.
+    /// `offset_v` returns a channel's offset (V).
     pub(crate) fn update(&mut self, pack: &mut Pack, current_a: f64, dt_s: f64, offset_v: impl Fn(usize) -> f64) {
         // A current of at most 0.002 C counts as rest.
         let is_rest = current_a.abs() <= 0.002 * pack.lowest_capacity_ah();

@@ -302,7 +302,8 @@ impl Simulation {
         }
     }
 
-    /// Measures the cell voltages and the pack voltage. Both include the drop of a contact, which is between the taps.
+    /// Measures the cell voltages and the pack voltage. Both include the voltage drop of a contact resistance, which is
+    /// between the taps.
     fn measure_voltages(&mut self) {
         self.sensed_v.clear();
         let taps = self.pack.voltages_v(self.current_a).zip(self.pack.cells());

@@ -16,7 +16,8 @@ use super::truth::{Ageing, Hysteresis, PackSettings, Spread};
 /// A named scenario.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Scenario {
-    /// The run of the paper: 2.6 Ah, -0.05 Ah per cycle, SOC 30-90 %, until 0.25 Ah.
+    /// The run in the paper "Battery Predictions for Electronic Prognostics": 2.6 Ah, -0.05 Ah per cycle, SOC 30-90 %,
+    /// until 0.25 Ah.
     Paper,
     /// A published example with a cell of 30 Ah: random discharge pulses, -1 Ah per cycle.
     Reference,
@@ -33,7 +34,7 @@ pub struct Settings {
     pub scenario: Scenario,
     /// Seed of all randomness.
     pub seed: u64,
-    /// The true pack.
+    /// Properties of the simulated pack.
     pub pack: PackSettings,
     /// Errors of the sensors.
     pub sensors: Sensors,
@@ -50,7 +51,7 @@ pub struct Settings {
     pub end_capacity_ah: f64,
     /// SOC window of the cycling scenarios: charging starts at the lower SOC, discharging at the upper SOC.
     pub soc_window: (f64, f64),
-    /// Number of loads between two reference measurements, for the random walk.
+    /// Only for the random walk: number of loads between two blocks of reference cycles.
     pub walk_steps: u32,
 }
 

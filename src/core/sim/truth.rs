@@ -228,7 +228,7 @@ impl Pack {
         }
     }
 
-    /// Changes the ageing from the next step on, which makes fade that is not linear possible.
+    /// Changes the ageing from the next step on, so that the cells can fade faster or slower over their life.
     pub fn set_ageing(&mut self, ageing: Ageing) {
         self.settings.ageing = ageing;
     }

@@ -3,14 +3,14 @@
 //! In: a [`Plan`] (the readable parts of the configuration), every frame of every interface with its time, and
 //! interface events. If the configuration allows a [`Monitor`](crate::monitor::Monitor), also its estimates. Out: a
 //! [`WiringReport`] with findings (each with evidence, reason and the line to change), checks that passed, and checks
-//! that were not possible. The observer has its own decoder without limits for readings. It therefore also works with
-//! a configuration that the estimator cannot use. Its memory use is bounded.
+//! that were not possible. The observer has its own decoder, which accepts readings of any size. The observer therefore
+//! also works with a configuration that the estimator cannot use. Its memory use is bounded.
 //!
 //! | file | purpose |
 //! | --- | --- |
 //! | `plan` | expected interfaces, messages and signals |
 //! | [`evidence`] | evidence about signals from values, names and bits; also used by `discover` |
-//! | `other_current` | statistics of the message with the pack current, if it also arrives on another interface |
+//! | `other_current` | statistics of the message with the pack current on other interfaces, if the message also arrives there |
 //! | `observer` | [`WiringObserver`]: collects frames, events and estimates |
 //! | `judge` | turns everything received into a [`WiringReport`] |
 //! | `report` | findings with their evidence, and the lines to change |

@@ -87,22 +87,24 @@ pub struct WiringObserver {
     listener: Listener,
     /// Indexes of the signals in the answer to each diagnostic question.
     by_question: BTreeMap<Question, Vec<(SignalList, usize)>>,
-    /// Statistics of the message with the pack current, for each other interface on which its identifier arrives.
+    /// The identifier of the message with the pack current may also arrive on other interfaces than the configured one.
+    /// Statistics of these frames, by interface.
     pub(crate) other_currents: BTreeMap<BusIndex, OtherCurrent>,
     /// Messages that any J1939 source address may send.
     groups: ParameterGroups,
     group_senders: GroupSenders,
-    /// Latest direction of a current that is sent as a magnitude, with its time: 1 = discharge, -1 = charge, `None` =
-    /// unknown. `None` if no direction is configured.
+    /// Latest direction of a current that is sent as a magnitude and a direction, with its time. The direction is 1 =
+    /// discharge, -1 = charge, or `None` = unknown. The whole field is `None` if no direction signal is configured.
     direction: Option<(Timestamp, Option<f64>)>,
     guards: Guards,
     pub(crate) protected: BTreeMap<(BusIndex, CanId), ProtectionStats>,
     responses: [VoltageResponse; 2],
     pub(crate) estimator: EstimatorStats,
     pub(crate) usage: UsageRecord,
-    /// Signals of the reported values in `usage`, in order.
+    /// The signals in which the pack reports its own state of charge or health, in the order of their values in
+    /// `usage`.
     pub(super) witnesses: Vec<Witness>,
-    /// The longest holes, and the number of all holes.
+    /// The longest holes. `hole_count` counts all holes.
     pub(crate) holes: Vec<Hole>,
     pub(crate) hole_count: usize,
     pub(crate) first: Option<Timestamp>,
@@ -306,7 +308,8 @@ impl WiringObserver {
         &self.responses[0]
     }
 
-    /// Slope of the median cell's voltage against the current, with the block length that `best_response` selects.
+    /// Slope of the median cell's voltage against the current. Both are averaged over blocks, with the block length
+    /// that `best_response` selects.
     pub(super) fn slope(&self) -> Option<Slope> {
         best_response(&self.responses).slope()
     }
@@ -338,7 +341,7 @@ impl WiringObserver {
     }
 
     fn note_hole(&mut self, hole: Hole) {
-        /// Maximum number of holes that are kept: more than a report lists.
+        /// Maximum number of holes that are kept. A report lists fewer.
         const MAX_HOLES: usize = 16;
         self.hole_count += 1;
         self.holes.push(hole);

@@ -1,4 +1,4 @@
-//! Plan: what `doctor` expects on the buses, from the readable parts of the configuration.
+//! Plan: what `doctor` expects on the buses. It is derived from the parts of the configuration that can be read.
 
 use super::evidence::SignalLabel;
 use super::evidence::usage::MAX_REPORTED;
@@ -159,7 +159,8 @@ impl SignalPlan {
 pub struct AnswerSource {
     /// The question that is answered.
     pub question: Question,
-    /// First byte of the signal's layout, counted after the echoed service and identifier.
+    /// First byte of the signal's layout. Byte 0 is the first byte after the service and the identifier, which the
+    /// answer repeats.
     pub first_byte: usize,
 }
 
@@ -225,7 +226,8 @@ impl Kind {
     }
 }
 
-/// A signal in which the pack reports its state of charge or health: an index into `signals` or `unconfigured`.
+/// A signal in which the pack reports its state of charge or health. `index` is its index in `signals` (if it is
+/// configured) or in `unconfigured`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Witness {
     pub(super) is_configured: bool,
@@ -233,8 +235,8 @@ pub(super) struct Witness {
 }
 
 impl Plan {
-    /// The signals in which the pack reports its charge or health, the configured signals first. Their order is the
-    /// order of the values in the record of the pack's use.
+    /// The signals in which the pack reports its charge or health, the configured signals first. The record of the
+    /// pack's use ([`super::evidence::usage`]) stores their values in the same order.
     pub(super) fn witnesses(&self) -> Vec<Witness> {
         let is_witness =
             |signal: &SignalPlan| matches!(signal.binding.channel, Channel::ReportedSoc | Channel::ReportedSoh);

@@ -57,13 +57,13 @@ pub enum Topic {
     Period,
     /// Stretches of the log or of one input are missing.
     Missing,
-    /// The cell model belongs to another cell.
+    /// The cell model belongs to another type of cell.
     CellModel,
     /// The current is not zero at rest.
     CurrentOffset,
     /// Voltages are noisier than configured.
     Noise,
-    /// Two states of charge on the buses disagree.
+    /// Two signals on the buses report different states of charge.
     ReportedSoc,
 }
 

@@ -14,7 +14,8 @@ const CONTAINER_HEAD: usize = 16;
 /// Largest content that a container may state, bytes. Usual containers have 128 KiB, the largest known ones a few MiB.
 const MAX_CONTENT: u32 = 64 << 20;
 
-/// How the current part of the file becomes content.
+/// How the bytes of the current outer object are stored. An outer object is a container, or an object outside of
+/// containers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Packing {
     /// The position is between two outer objects.
@@ -25,14 +26,14 @@ enum Packing {
     Deflated,
 }
 
-/// Reads the content of the containers, and outer objects without a container, one after another.
+/// Reads, one after another, the content of the containers and the objects outside of containers.
 ///
 /// For a damaged container, returns an error of the kind `InvalidData`. The next call continues with the next
 /// container.
 pub(super) struct Containers {
     file: ByteStream<Box<dyn Read>>,
     packing: Packing,
-    /// Bytes of the current part that are still in the file.
+    /// Bytes of the current outer object that have not been read from the file.
     left: u64,
     /// Bytes of content that remain according to the current container.
     content_left: u64,
@@ -173,7 +174,7 @@ impl Read for Containers {
                 self.content_left = self.content_left.saturating_sub(count as u64);
                 return Ok(count);
             }
-            // The content has ended or is damaged. The bytes left in this part are skipped.
+            // The content has ended or is damaged. `open_next` skips the rest of the outer object.
             self.packing = Packing::Between;
             made?;
         }

@@ -67,7 +67,7 @@ pub(super) fn decode(kind: u32, object: &[u8], start_ns: i64, channels: &mut Cha
         CAN_FD_MESSAGE => Item::Frame { time, channel, frame: fd(body)? },
         CAN_FD_MESSAGE_64 => Item::Frame { time, channel, frame: fd_64(body, header)? },
         CAN_ERROR_EXT => {
-            // The flags say whether the controller states the kind of error.
+            // If bit 0 or 1 of the flags is set, the controller has reported a code for the kind of error.
             let class = if u32_at(body, 4, false) & 3 != 0 { PROTOCOL_ERROR } else { 0 };
             Item::ErrorFrame { time, channel, class }
         }
@@ -75,7 +75,7 @@ pub(super) fn decode(kind: u32, object: &[u8], start_ns: i64, channels: &mut Cha
     })
 }
 
-/// Size of the fields before a variable part, bytes.
+/// Size of the fixed fields at the beginning of the content, bytes. A variable part may follow.
 fn fields_len(kind: u32) -> usize {
     match kind {
         CAN_MESSAGE | CAN_MESSAGE2 => 16,
@@ -107,7 +107,8 @@ fn fd_64(body: &[u8], header: usize) -> Result<Frame, String> {
     if flags & 0x10 != 0 {
         return raw(id, true, None, &[0; 8][..length_of_code(code, false)]).check();
     }
-    // Further fields may follow the payload. Their position counts from the start of the object.
+    // Further fields may follow the payload. Byte 35 states their position from the start of the object; 0 = no further
+    // fields.
     let end = match usize::from(body[35]) {
         0 => body.len(),
         place => place.saturating_sub(header).min(body.len()),

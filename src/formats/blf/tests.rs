@@ -118,7 +118,8 @@ fn bytes_that_are_not_stored_are_zero() {
     body.extend(0x3000_u32.to_le_bytes());
     body.resize(40, 0);
     body.extend([7; 48]);
-    // The first object does not state the position of further fields behind the payload, the second does.
+    // An object may have further fields after its payload. The first object has none. The second object has such
+    // fields, and byte 35 states their position.
     let place = 32 + body.len() as u8;
     let further = [&body[..35], &[place], &body[36..], &[9; 8]].concat();
     for body in [body, further] {

@@ -10,8 +10,8 @@ use crate::byte_stream::{cut, damaged, u16_at, u64_at};
 pub(super) const FIRST_BLOCK: u64 = 64;
 /// Size of a block's head, bytes.
 pub(super) const BLOCK_HEAD: u64 = 24;
-/// Maximum number of data bytes that are read of a describing block. Such blocks have less than 1 KiB without their
-/// texts.
+/// Maximum number of data bytes that are read from a block that describes the measurements. Without texts, such a block
+/// has less than 1 KiB.
 const MAX_DESCRIPTION: u64 = 4096;
 
 /// An MDF file and its first 64 bytes.
@@ -27,7 +27,7 @@ pub(super) struct MdfFile {
 pub(super) struct Block {
     pub(super) address: u64,
     pub(super) id: [u8; 4],
-    /// Length with the head, bytes, as stated.
+    /// Length with the head, bytes, as the head states it.
     pub(super) len: u64,
     pub(super) links: u64,
 }
@@ -38,7 +38,7 @@ impl Block {
         self.address + BLOCK_HEAD + 8 * self.links
     }
 
-    /// Length of the data after the links, as stated.
+    /// Length of the data after the links, as the head states it.
     pub(super) fn data_len(&self) -> u64 {
         self.len.saturating_sub(BLOCK_HEAD + 8 * self.links)
     }
@@ -130,7 +130,7 @@ impl MdfFile {
         Ok(u64::from_le_bytes(link))
     }
 
-    /// Reads the data of a describing block, at least `needed` bytes.
+    /// Reads the data of a block that describes the measurements, at least `needed` bytes.
     pub(super) fn description(&self, block: &Block, needed: usize) -> io::Result<Vec<u8>> {
         let mut data = vec![0; usize::try_from(block.data_len().min(MAX_DESCRIPTION)).unwrap_or(0)];
         let read = self.read(block.data_address(), &mut data)?;

@@ -13,7 +13,7 @@ const LISTS: [&[u8; 4]; 2] = [b"##DL", b"##LD"];
 /// Maximum unpacked size of a transposed block, bytes. Such a block is held in memory as a whole. The standard allows 4
 /// MiB.
 const MAX_TRANSPOSED: u64 = 32 << 20;
-/// Buffer for compressed bytes, bytes.
+/// Size of the buffer for compressed data, bytes.
 const PACKED_BUFFER: usize = 32 * 1024;
 
 pub(super) struct DataBlocks {
@@ -52,7 +52,7 @@ struct Section {
     file: Rc<MdfFile>,
     at: u64,
     left: u64,
-    /// Whether the end of the file is also a valid end of the section.
+    /// Whether the section may end early, at the end of the file.
     is_open: bool,
 }
 
@@ -113,7 +113,7 @@ impl DataBlocks {
 
     fn open_body(&mut self, block: &Block) -> io::Result<Body> {
         let (at, mut left) = (block.data_address(), block.data_len());
-        // A recorder that lost its supply has not written the length of its last block.
+        // If a recorder has lost its supply, the length of its last block is 0, because it was not written yet.
         let is_open = self.file.has_open_data() && left == 0;
         if is_open {
             left = self.file.len().saturating_sub(at);
@@ -208,7 +208,8 @@ impl Transposed {
             self.next += out.len();
             return out.len();
         }
-        // The remaining bytes: records that are longer than the buffer, and bytes after the last record.
+        // Copies byte by byte what the loop above cannot copy: parts of a record that is longer than the buffer, and
+        // bytes after the last record.
         for (byte, at) in out[..count].iter_mut().zip(self.next..) {
             let is_in_record = at < columns * rows;
             *byte = self.bytes[if is_in_record { at % columns * rows + at / columns } else { at }];
@@ -220,7 +221,7 @@ impl Transposed {
 
 fn unpack_error(error: io::Error) -> io::Error {
     match error.kind() {
-        // The decoder states that it needs more bytes than the block has.
+        // The block ends, but the decoder needs more bytes.
         io::ErrorKind::UnexpectedEof => cut(format!("a compressed data block ends too early: {error}")),
         _ => damaged(format!("compressed data block with damaged data: {error}")),
     }
@@ -250,7 +251,7 @@ fn open_part(file: &MdfFile, address: u64, parts_left: u64, is_circular: bool) -
     let part = file.block(address, &LISTS)?;
     let mut links = part.links.saturating_sub(1);
     if &part.id == b"##LD" {
-        // Further links lead to invalidation bits.
+        // The links after the data links lead to invalidation bits.
         let data = file.description(&part, 8)?;
         links = links.min(u64::from(u32_at(&data, 4, false)));
     }

@@ -6,7 +6,7 @@ use super::field::Field;
 use crate::Item;
 use crate::raw_frame::{RawFrame, length_of_code};
 
-/// Flag of a 29-bit identifier, if the record has no field for it.
+/// Flag in the identifier that marks a 29-bit identifier. It is used if the record has no field for this mark.
 const EXTENDED: u64 = 1 << 31;
 /// Identifier without flags.
 const ID_BITS: u64 = 0x1FFF_FFFF;
@@ -39,9 +39,11 @@ pub(super) enum Payload {
     None,
     /// In the record: first byte and length.
     Fixed(usize, usize),
-    /// In signal data: the field with the offset, and the link to the data.
+    /// In a block of signal data: the record's field with the offset of the payload in the block, and the link to the
+    /// block.
     Signal(Field, u64),
-    /// In records of another group of the same data: the field with the offset, and the group's address.
+    /// In the records of another channel group in the same data block: the record's field with the offset of the
+    /// payload, and the address of this group.
     Group(Field, u64),
 }
 
@@ -75,13 +77,13 @@ impl Event {
         nanos.saturating_add(500).div_euclid(1000).saturating_mul(1000)
     }
 
-    /// Channel as written; 1 without a field.
+    /// Channel number as written; 1 if the record has no field for it.
     #[inline]
     pub(super) fn channel(&self, record: &[u8]) -> u32 {
         self.channel.map_or(1, |field| u32::try_from(field.number(record)).unwrap_or(u32::MAX))
     }
 
-    /// The item of a record. `values` is the payload outside of the record, if the payload is there.
+    /// Converts a record to an item. `values` is the payload if it is outside of the record.
     #[inline]
     pub(super) fn item(&self, record: &[u8], values: Option<&[u8]>, time_ns: i64, channel: u8) -> Item {
         let time = Timestamp::from_nanos(time_ns);
@@ -114,7 +116,7 @@ impl Event {
         let fd = is_fd.then(|| (is_set(self.brs), is_set(self.esi)));
         let id = (id & ID_BITS) as u32;
         if remote {
-            // Some writers state the requested length only as the code, and state a data length of 0.
+            // Some writers state the requested length only in the length code, and write a data length of 0.
             let len = code.or(stated).unwrap_or(0).min(8);
             return Ok(RawFrame { id, extended, remote, fd: None, data: &[0; 8][..len] });
         }
@@ -131,7 +133,7 @@ impl Event {
     }
 }
 
-/// Class of an error: 1 bit, 2 form, 3 stuffing, 4 checksum, 5 acknowledgement.
+/// SocketCAN class of an error type in the file: 1 bit, 2 form, 3 stuffing, 4 checksum, 5 acknowledgement.
 fn error_class(error: u64) -> u32 {
     match error {
         1..=4 => PROTOCOL_ERROR,

@@ -13,7 +13,7 @@ const FIRST_OTHER: u8 = 6;
 /// Conversion of a channel.
 const IDENTITY: u8 = 0;
 const LINEAR: u8 = 1;
-/// Types of a channel without bytes in the record.
+/// Types of channels that have no bytes in the record.
 const VIRTUAL_MASTER: u8 = 3;
 const VIRTUAL: u8 = 6;
 
@@ -61,7 +61,8 @@ impl ChannelBlock {
 }
 
 impl Field {
-    /// Creates a field from a channel block. `Ok(None)` = the channel has a conversion that is not linear.
+    /// Creates a field from a channel block. `Ok(None)` = the channel has a conversion that is not linear, or it is a
+    /// virtual channel whose value is not constant.
     ///
     /// # Errors
     /// Fails if the block is damaged, or if the field is longer than the record.
@@ -75,9 +76,9 @@ impl Field {
         };
         let big_endian = channel.data_type < FIRST_OTHER && channel.data_type & 1 != 0;
         let (byte, shift, bits) = (channel.byte as usize, u32::from(channel.bit), channel.bits);
-        // The number of a virtual channel is the record's index. If the factor is 0, as usual for the fields of a bus,
-        // the value is constant. A converter that stores the index keeps the factor, so the value is constant there
-        // too.
+        // A virtual channel has the record's index as its number. If its factor is 0, as usual for the fields of a bus,
+        // its value is constant. Some converters store the index in the record but keep the factor 0, so any channel
+        // with this factor counts as constant.
         if factor == 0.0 || matches!(channel.kind, VIRTUAL_MASTER | VIRTUAL) {
             let constant = offset.clamp(0.0, f64::from(u32::MAX)) as u64;
             let number = NumberType::Unsigned;

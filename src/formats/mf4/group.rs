@@ -1,4 +1,4 @@
-//! Reads the records of groups that share their data.
+//! Reads the records of one data group of an MF4 file. The record groups in it share one stream of data.
 
 use std::collections::VecDeque;
 use std::io;
@@ -27,9 +27,9 @@ pub(super) struct GroupReader {
     stream: ByteStream<DataBlocks>,
     id_len: usize,
     records: Vec<RecordGroup>,
-    /// For each record group, where the payloads outside of its records are.
+    /// For each record group, the place of the payloads that its records do not contain.
     outside: Vec<Outside>,
-    /// Records left of sorted data; `None` = unknown.
+    /// Number of records still to be read, if the data contain records of only one group; `None` = unknown.
     left: Option<u64>,
     /// Number of the first channel.
     first_channel: u32,
@@ -39,12 +39,12 @@ pub(super) struct GroupReader {
     has_ended: bool,
 }
 
-/// Payloads outside of the records of a group.
+/// Place of the payloads that the records of a group do not contain.
 enum Outside {
-    /// The records contain all their data.
+    /// The records contain their payloads.
     None,
     Signal(SignalValues),
-    /// Records of the group with this index.
+    /// The payloads are records of the group with this index.
     Group(usize, ValueGroup),
 }
 
@@ -140,7 +140,7 @@ impl GroupReader {
         }
     }
 
-    /// Reads a record; `None` if it gives no item now, or at the end.
+    /// Reads a record. `None` if it contains no item, if its item still waits for a payload, or at the end.
     #[inline]
     fn read_record(&mut self, channels: &mut ChannelList) -> io::Result<Option<Stamped>> {
         let next = if self.left == Some(0) { None } else { record_of(&self.records, self.id_len, &mut self.stream)? };
@@ -181,7 +181,7 @@ impl GroupReader {
         Ok(Some(stamped))
     }
 
-    /// Reads a value of variable length, and the records that waited for it.
+    /// Reads a value of variable length, and makes the items of the records that waited for it.
     fn read_value(&mut self, group: usize, head: usize, channels: &mut ChannelList) -> io::Result<()> {
         let bytes = self.stream.fill(head)?;
         if bytes.len() < head {

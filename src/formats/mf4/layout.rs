@@ -11,7 +11,8 @@ use crate::byte_stream::{WINDOW, cut, damaged, u16_at, u32_at, u64_at};
 
 /// Maximum number of groups and channels of a file. Usual bus logs have fewer than 5,000.
 const MAX_BLOCKS: usize = 200_000;
-/// Maximum number of groups with frames, each with its own data and window. Sorted files have three per channel.
+/// Maximum number of groups with frames. Each group is read through its own window of the file. Sorted files have three
+/// groups per CAN channel.
 const MAX_OPEN_GROUPS: usize = 128;
 /// Number of channel names in the message about a file without frames.
 const MAX_NAMES: usize = 5;
@@ -220,7 +221,8 @@ impl Scan {
             id,
             extended: plain("IDE")?,
             code: plain("DLC")?,
-            // Ignored if a table converts it: the stored number is then the length code, which DLC states too.
+            // `DataLength` is ignored if a table converts it. Its stored number is then the length code, which `DLC`
+            // also contains.
             len: plain("DataLength")?,
             channel: plain("BusChannel")?,
             is_fd: plain("EDL")?,

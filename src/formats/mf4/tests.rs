@@ -11,7 +11,8 @@ use crate::{Channel, Item};
 
 const START_NS: i64 = 1_700_000_000_123_456_789;
 
-/// A file of our own writer with all kinds of frames, 1 us apart.
+/// Writes a file with [`Mf4Writer`]: all kinds of frames, 1 us apart. Returns its bytes, and the items that a reader
+/// must find.
 fn written(count: i64) -> (Vec<u8>, Vec<Item>) {
     let mut writer = Mf4Writer::new(Cursor::new(Vec::new())).expect("memory");
     let mut items = Vec::new();
@@ -33,7 +34,8 @@ fn written(count: i64) -> (Vec<u8>, Vec<Item>) {
     (writer.finish().expect("memory").into_inner(), items)
 }
 
-/// Builds files as CANedge writes them: unfinalized, unsorted, with payloads as records of another group.
+/// Builds files as the logger CANedge writes them: not finalised, with the records of all groups in one sequence. The
+/// payload of a frame is a record of another group.
 struct Unsorted {
     bytes: Vec<u8>,
     values: u64,
@@ -71,8 +73,8 @@ impl Unsorted {
         self.block(b"##CG", &[next, first, 0, 0, 0, 0], &data)
     }
 
-    /// Writes the description: frames are group 1, payloads group 2. If `is_circular` is true, the data are a list that
-    /// links to itself.
+    /// Writes the blocks that describe the groups: group 1 contains frames, group 2 payloads. If `is_circular` is true,
+    /// the data are a list that links to itself.
     fn new(is_circular: bool) -> Self {
         let mut file = Self { bytes: b"UnFinMF 4.11    test    ".to_vec(), values: 0 };
         file.bytes.resize(60, 0);
@@ -114,7 +116,7 @@ impl Unsorted {
         [&[2][..], &(data.len() as u32).to_le_bytes(), data].concat()
     }
 
-    /// Adds a frame whose payload follows it, or precedes it.
+    /// Adds a frame and its payload. If `value_first` is true, the payload precedes the frame.
     fn add(&mut self, us: u64, id: u32, data: &[u8], value_first: bool) {
         let record = self.record(us, id, data.len() as u8);
         let value = self.value(data);
@@ -174,7 +176,7 @@ fn cut_unfinalized_file_keeps_frames_before_cut() {
 #[test]
 fn cut_finalized_file_gives_error_with_place() {
     let (bytes, _) = written(40);
-    // The last bytes are reserved.
+    // The last eight bytes are reserved, so a cut there is not an error.
     for len in 32..bytes.len() - 8 {
         assert!(read(&bytes[..len]).error.is_some(), "cut after {len} bytes");
     }

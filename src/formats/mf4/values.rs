@@ -12,10 +12,11 @@ use crate::byte_stream::{ByteStream, cut, damaged, u32_at};
 const MAX_VALUE: usize = 64;
 /// Size of the length before a value, bytes.
 const LENGTH: usize = 4;
-/// Maximum number of values without a record, and of records without a value, in unsorted data. Recorders write both
-/// next to each other.
+/// Maximum number of values without a record, and of records without a value, in unsorted data. A sound file needs few,
+/// because recorders write a record and its value next to each other.
 const MAX_WAITING: usize = 16_384;
-/// Maximum number of times that signal data are read from the start again, because an offset goes back.
+/// If an offset is smaller than the offset before it, the signal data are read from the start again. Maximum number of
+/// such restarts.
 const MAX_RESTARTS: usize = 1000;
 
 /// Values of sorted groups, in blocks of their own.

@@ -1,7 +1,8 @@
 //! Writes frames as a sorted MF4 file with bus logging, which asammdf and python-can read.
 //!
-//! Each kind of frame is a group of its own. The records of a group are compressed in blocks as they come; the
-//! description of the groups follows the data, and the header at the start of the file links to it at the end.
+//! Each kind of frame is a group of its own. The records of a group are compressed in blocks as they arrive. The
+//! description of the groups is written after the data. At last, the header at the start of the file gets the address
+//! of this description.
 
 use std::io::{self, Seek, SeekFrom, Write};
 
@@ -26,8 +27,9 @@ const BUS_EVENT_CHANNEL: u32 = 1 << 10;
 const UNSIGNED: u8 = 0;
 const SIGNED: u8 = 2;
 const BYTES: u8 = 10;
-/// Length of the time, and of the fields of a frame between time and data, bytes.
+/// Length of the time in a record, bytes.
 const TIME_LEN: usize = 8;
+/// Length of the longest fields between time and data in a record, bytes.
 const FIELDS_LEN: usize = 12;
 
 /// Fields of a frame after the time, with their lengths.

@@ -21,8 +21,9 @@ const IF_NAME: u16 = 2;
 const IF_TSRESOL: u16 = 9;
 const IF_TSOFFSET: u16 = 14;
 
-/// Size of kind and length before a block's content, and of all fields around the content, bytes.
+/// Size of the fields before a block's content (kind and length), bytes.
 const BLOCK_HEAD: usize = 8;
+/// Size of all fields around a block's content (kind and length before it, length after it), bytes.
 const BLOCK_FRAME: usize = 12;
 /// Maximum number of interfaces of a section. Usual captures have fewer than ten.
 const MAX_INTERFACES: usize = 1024;
@@ -30,7 +31,7 @@ const MAX_INTERFACES: usize = 1024;
 struct Interface {
     link: Option<LinkType>,
     channel: Channel,
-    /// Time stamps per second.
+    /// Number of time units per second.
     per_second: u64,
     offset_s: i64,
 }
@@ -194,7 +195,9 @@ fn packet(
     Ok(decoder.decode(interface.link, bytes, big_endian, time, channel_of(interface)))
 }
 
-/// The channel that the file states for an interface. The cooked header with a number names the channel itself.
+/// The channel that the file states for an interface. `None` in two cases: the interface is `any`, which captures all
+/// interfaces, or the file states no name and each packet contains the number of its interface
+/// ([`LinkType::CookedTwo`]).
 fn channel_of(interface: &Interface) -> Option<&Channel> {
     match (&interface.channel, interface.link) {
         (Channel::Number { .. }, Some(LinkType::CookedTwo)) => None,

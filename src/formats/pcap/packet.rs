@@ -57,8 +57,8 @@ const FRAME_HEAD: usize = 8;
 #[derive(Debug, Default)]
 pub(super) struct PacketDecoder {
     pub(super) channels: ChannelList,
-    /// Number of frames whose identifier shows the order that the file should have, minus the number of frames that
-    /// show the other order.
+    /// Number of frames whose identifier shows the byte order that the file should have, minus the number of frames
+    /// whose identifier shows the other byte order.
     right_order: i32,
 }
 
@@ -100,7 +100,8 @@ impl PacketDecoder {
             None => self.channels.of_label(number_at.map_or(0, |at| u32_at(packet, at, true))),
         };
         let Some(channel) = channel else { return Item::Bad("more than 256 channels".to_owned()) };
-        // Without a cooked header, the identifier is big-endian; with it, the identifier has the recorder's byte order.
+        // Without a cooked header, the identifier is big-endian. With this header, the identifier has the byte order of
+        // the recorder.
         let is_big_endian = protocol.is_none() || big_endian;
         self.frame(&packet[head..], is_big_endian, is_fd, time, channel).unwrap_or_else(Item::Bad)
     }
@@ -117,7 +118,8 @@ impl PacketDecoder {
             return Err(format!("CAN frame of {} bytes, must have at least {FRAME_HEAD}", bytes.len()));
         }
         let (len, flags) = (usize::from(bytes[4]), bytes[5]);
-        // The flags of CAN XL are at the position of the length of other frames, which is at most 64.
+        // A CAN XL frame has its flags where other frames have their length. A length is at most 64, so this bit marks
+        // CAN XL.
         if bytes[4] & XL != 0 {
             return Ok(Item::Xl);
         }
@@ -143,7 +145,7 @@ impl PacketDecoder {
         if self.right_order < 0 { other } else { right }
     }
 
-    /// Notes the byte order of a frame without returning the frame.
+    /// Only counts the byte order of a frame.
     pub(super) fn note_order(&mut self, frame: &[u8], big_endian: bool) {
         if frame.len() >= FRAME_HEAD && frame[4] & XL == 0 {
             self.identifier(frame, big_endian);

@@ -285,7 +285,8 @@ fn skip_name(line: &mut Cursor<'_>) -> Result<bool, Fault> {
     line.parse(EXPECTED, flag)
 }
 
-/// Whether the next word is `d` or `r` of the older form of a CANFD line. A `d` before 32 is a length code instead.
+/// Whether the next word is `d` or `r` of the older form of a CANFD line. In `d 32`, the `d` is a length code (13 = 32
+/// bytes).
 fn is_kind(mut line: Cursor<'_>) -> bool {
     match line.word() {
         b"d" => line.word() != b"32",

@@ -16,7 +16,7 @@ use super::cursor::{Base, Cursor, Fault, frame, hex_byte, identifier, joined_byt
 use super::{CHANNEL, Channels, Grammar, date, time};
 use crate::Item;
 
-/// Bit of an identifier that marks an error frame, and mask of its class.
+/// Bit of an identifier that marks an error frame, and mask of the error class in such an identifier.
 const ERROR_FLAG: u32 = 0x2000_0000;
 const ERROR_MASK: u32 = 0x1FFF_FFFF;
 
@@ -24,13 +24,13 @@ const STAMP: &str = "a time in parentheses";
 const IDENTIFIER: &str = "an identifier of at most 8 hex digits";
 const LENGTH: &str = "a length of 0 to 64 in brackets";
 
-/// Text with stamps.
+/// Reads screen text whose lines have time stamps.
 pub(super) struct Candump {
     /// A line without its escape sequences.
     plain: Vec<u8>,
 }
 
-/// Text or a log whose stamps are the times since the previous frame.
+/// Reads screen text or a log whose stamps are the times since the previous frame.
 pub(super) struct CandumpDeltas {
     text: Candump,
     sum_ns: i64,
@@ -248,12 +248,13 @@ pub(super) fn is_screen_line(line: &[u8]) -> bool {
 
 /// Whether the stamps of a log are the times since the previous frames (`-td`).
 ///
-/// Such stamps have fewer than ten digits of seconds. More than a quarter of them are smaller than the stamp before, or
-/// the stamps do not grow.
+/// Only stamps with fewer than ten digits of seconds are considered, because longer stamps count from 1970. The
+/// function returns true in two cases: more than a quarter of the stamps are smaller than the previous stamp, or the
+/// stamps do not grow from the first half of the text to the second half.
 ///
 /// Stamps of `-tz` count from the first frame, so they grow. They decrease only where the frames of several interfaces
-/// are out of order. Equal stamps prove nothing, because recorders with a coarse clock write them too. Whole seconds
-/// that do not grow prove nothing either.
+/// are out of order. Equal stamps do not count as decreases, because recorders with a coarse clock write them too. For
+/// the same reason, stamps that are all whole seconds and do not grow do not count as times since the previous frame.
 pub(super) fn has_deltas(head: &[u8]) -> bool {
     /// Minimum number of stamps to conclude that stamps do not grow.
     const FEWEST_STAMPS: usize = 16;

@@ -1,12 +1,12 @@
 //! Reads the text logs of the CSS Electronics loggers CL1000, CL2000 and CL3000.
 //!
 //! Header: `# Time: 20231005T071031` (start) and further settings, then `Timestamp;Type;ID;Data` with any separator. A
-//! row: `05T071031805;0;326;0000000000000100`. Types: 0 standard, 1 extended; 8 and 9 are the same for frames sent by
-//! the logger.
+//! row: `05T071031805;0;326;0000000000000100`. Types of received frames: 0 standard, 1 extended. Types of frames that
+//! the logger has sent: 8 standard, 9 extended.
 //!
-//! The stamp contains the last parts of year, month, day, hour, minute, second and millisecond, with or without
-//! separators. The missing first parts come from the header's time. If a stamp is far before the previous stamp, the
-//! last missing part has increased by one.
+//! A stamp consists of year, month, day, hour, minute, second and millisecond, with or without separators. Its first
+//! parts can be missing; they come from the header's time. If a stamp is far before the previous stamp, the last of the
+//! missing parts has increased by one: in the row above, this is the month.
 
 use std::io;
 
@@ -106,7 +106,8 @@ impl Css {
         let mut parts = self.start;
         let first = 7 - read_parts(field, 7, &mut parts)?;
         let at_ns = total_ns(&parts)?.checked_add(self.carry_ns)?;
-        // The length of the last missing part. This part increases when the stamp restarts.
+        // The length of the last missing part, in ns. If the stamp starts again at a small value, this part has
+        // increased by one.
         let period_ns = match first {
             0 => None,
             1 | 2 => Some((total_ns(&next_month(parts, first))? - total_ns(&parts)?).max(0)),
@@ -122,7 +123,7 @@ impl Css {
     }
 }
 
-/// The same point one year later (`first` = 1: the year is missing) or one month later.
+/// The same point in time one year later (if `first` is 1, because the year is missing) or one month later.
 fn next_month(mut parts: [i64; 7], first: usize) -> [i64; 7] {
     parts[first - 1] += 1;
     if parts[1] > 12 {

@@ -88,7 +88,8 @@ impl Parts {
         } else if AFTER_NOON.iter().any(|mark| mark.as_bytes() == word) {
             self.is_after_noon = Some(true);
         } else if let Some(month) = (1..).zip(MONTHS).find(|(_, names)| names.iter().any(|name| begins(word, name))) {
-            // A weekday such as the Italian "mar" comes before the month and is overwritten.
+            // The Italian weekday "mar" looks like the month March. A weekday comes before the month, so the month
+            // replaces it.
             self.month = Some(month.0);
         }
     }

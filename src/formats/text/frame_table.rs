@@ -8,8 +8,8 @@
 //! unit, the first 16 KiB of the log decide. Times with a decimal point are then seconds. Whole numbers are Unix times,
 //! or have the usual unit of their column. [`Grammar::remark`] names a unit that was assumed.
 //!
-//! Identifiers and data bytes are hexadecimal, or decimal if the first rows show it. An identifier above 7FF is
-//! extended, even if the table says otherwise, as in SavvyCAN.
+//! Identifiers and data bytes are hexadecimal, or decimal if the first rows show it. An identifier above 7FF counts as
+//! extended, even if the table says otherwise. SavvyCAN does the same.
 
 use std::io;
 
@@ -28,8 +28,8 @@ const MILLISECONDS: i32 = 6;
 const SECONDS: i32 = 9;
 /// Minimum number of rows whose times are compared with [`FRAME_NS`] to find the unit.
 const FEWEST_ROWS: usize = 20;
-/// Smallest and largest plausible mean time between frames. The lower limit is below the mean of four buses at 1 Mbit/s
-/// that carry the shortest frames without a pause. At the upper limit, a bus carries six frames per minute.
+/// Smallest and largest plausible mean time between frames. Even if four buses at 1 Mbit/s carry the shortest frames
+/// without a pause, the mean is above the lower limit. At the upper limit, a bus carries six frames per minute.
 const FRAME_NS: [i64; 2] = [10_000, 10_000_000_000];
 const DAY_NS: i64 = 86_400_000_000_000;
 
@@ -129,7 +129,7 @@ struct FirstRows {
     decimals: usize,
     has_three_digits: bool,
     has_hex: bool,
-    /// Whether the table marks an identifier as standard that would exceed 7FF as a hexadecimal number.
+    /// Whether an identifier is marked as standard, but would exceed 7FF if it were hexadecimal.
     has_decimal_id: bool,
 }
 
@@ -162,7 +162,7 @@ impl FirstRows {
         if is_decimal { Base::Dec } else { Base::Hex }
     }
 
-    /// The unit of times without a stated unit, and whether it is assumed.
+    /// The unit of the times if the header states none, and whether this unit is only assumed.
     fn unit(&self, usual: i32) -> (i32, bool) {
         if self.decimals * 2 > self.times.len() || self.times.is_empty() {
             return (SECONDS, false);
@@ -232,7 +232,7 @@ impl FrameTable {
                 Column::Data if is_cut && !self.has_length => return Err(missing("a line end after the data")),
                 Column::Data => {
                     (data, count) = bytes(field).ok_or_else(|| missing("at most 64 data bytes"))?;
-                    // The length may be the code of CAN FD.
+                    // The length may be a CAN FD length code (DLC) instead of a number of bytes.
                     let code_len = len.and_then(|len| fd_length(len as u32));
                     len = if code_len == Some(count) { code_len } else { len.or(Some(count)) };
                     len.filter(|len| *len == count || kind != RowKind::Data).ok_or_else(|| missing(LENGTH))?;
@@ -273,7 +273,7 @@ impl FrameTable {
     }
 }
 
-/// The expected content, for the fault about a length that contradicts the data.
+/// Expected content of the row, for the message about a length that contradicts the data.
 const LENGTH: &str = "as many data bytes as the row's length states";
 
 /// Kind of a row, as its column `Frame Type` states it.
@@ -321,7 +321,8 @@ fn header(line: &[u8]) -> Option<(u8, Vec<Column>)> {
     let text = String::from_utf8_lossy(line).to_lowercase();
     let names: Vec<&str> = match separator {
         Some(separator) => text.split(char::from(separator)).collect(),
-        // Columns of fixed width. The rows separate them by zero bytes.
+        // Columns of fixed width: zero bytes or at least two blanks separate the names; zero bytes separate the fields
+        // of the rows.
         None => text.split('\0').flat_map(|part| part.split("  ")).filter(|name| !name.trim().is_empty()).collect(),
     };
     let is_of_battery = names.iter().any(|name| ["volt", "current"].iter().any(|word| name.contains(word)));

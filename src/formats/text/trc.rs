@@ -2,11 +2,12 @@
 //!
 //! Comment lines begin with `;`. The header contains `;$FILEVERSION=2.1`, `;$STARTTIME=45244.925` (days since 30
 //! December 1899) and, from version 2.0, `;$COLUMNS=N,O,T,B,I,d,R,L,D`. If the file version is missing, it is 1.0, and
-//! the comment `Start time:` states the start. Offsets are in milliseconds. An identifier with more than four digits is
-//! extended.
+//! the comment `Start time:` states the start. Each row has its offset from the start in milliseconds. An identifier
+//! with more than four digits is extended.
 //!
-//! A date in a file is local time without a zone; it is read as UTC. The start time is a 64-bit float, which resolves
-//! microseconds. If its written digits agree with a whole millisecond, that millisecond is the start.
+//! A date in a file is local time without a zone; it is read as UTC. The start time in days is read as a 64-bit float,
+//! which resolves about a microsecond. If a whole millisecond rounds to the written digits, this millisecond is the
+//! start.
 
 use std::io;
 
@@ -20,13 +21,14 @@ use crate::Item;
 /// 1 January 1970 in days since 30 December 1899.
 const UNIX_DAYS: i128 = 25_569;
 const DAY_NS: i128 = 86_400_000_000_000;
-/// Number of bits in which a 64-bit float stores the fraction of a day, for dates from 1911.
+/// For dates from 1911, a 64-bit float of days stores the fraction of the day in at most this number of bits.
 const FRACTION_BITS: i32 = 40;
 /// Largest number of columns. The newest version has 15.
 const MAX_COLUMNS: usize = 32;
 
 pub(super) struct Trc {
-    /// The columns by the letters of `$COLUMNS`. `1` is the type of versions 1.1 to 1.3, which contains the direction.
+    /// The columns, by the letters of `$COLUMNS`. `1` stands for the type column of versions 1.1 to 1.3, which also
+    /// contains the direction.
     columns: Vec<u8>,
     start_ns: i64,
     has_start: bool,
@@ -109,7 +111,7 @@ impl Trc {
                 b'T' | b'1' => row.kind = line.word(),
                 b'B' => row.channel = Some(line.parse(CHANNEL, |word| bus(word, channels))?),
                 b'I' => {
-                    // Rows without a frame have other columns after the bus.
+                    // A row without a frame has other columns after the bus column.
                     if let Some(item) = self.without_identifier(&row, at, channels)? {
                         return Ok(item);
                     }
@@ -230,7 +232,7 @@ fn start_ns(days: &[u8]) -> Option<i64> {
     let scale = 2_f64.powi(FRACTION_BITS);
     let exact_ns = ((value * scale) as i128 * DAY_NS) >> FRACTION_BITS;
     let digits = text.split_once('.').map_or(0, |(_, digits)| digits.len().min(17) as u32);
-    // Half of the last written digit, but at least half of the last bit of the number.
+    // Half a unit of the last written digit, but at least half of the float's last bit (315 ns).
     let tolerance_ns = (DAY_NS / 2 / 10_i128.pow(digits)).max(315);
     let nearest = |unit_ns: i128| (exact_ns + unit_ns / 2) / unit_ns * unit_ns;
     let whole_ms = nearest(1_000_000);

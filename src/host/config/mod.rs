@@ -1,9 +1,10 @@
 //! Reads, merges and checks the TOML configuration. All faults are reported at once, each with file, line, key, found
 //! value and allowed values.
 //!
-//! In: the configuration file, its drop-ins and the files they name (DBC files, cell models). Out: [`Config`],
-//! consistent settings for the other modules, or [`ConfigFaults`], one line per fault. In this module, to "report" a
-//! fault means to add it to the list of faults and to continue.
+//! In: the configuration file, its drop-ins (files that change single keys of it), and the DBC files and cell models
+//! that these files name. Out: [`Config`], which contains consistent settings for the other modules, or
+//! [`ConfigFaults`], which contains one line per fault. In this module, to "report" a fault means to add it to the list
+//! of faults and to continue.
 //!
 //! The module has six layers. Each layer uses only the layers listed above it. No layer uses this file.
 //!
@@ -17,9 +18,9 @@
 //! | `description` | the configuration and its keys in words |
 //!
 //! # How to add a key
-//! 1. In `schema/keys`, add a line to the table's `section!`: doc comment, name, type, unit, range, presence. In a
-//!    table that `gives` the parameters of an algorithm, the key sets the field of the same name. To set another field,
-//!    or to compute the value, write `=> field: value` on the same line.
+//! 1. In `schema/keys`, add a line to the table's `section!`: doc comment, name, type, unit, range, presence. If the
+//!    declaration of the table says that it `gives` the parameters of an algorithm, the key sets the parameter of the
+//!    same name. To set a parameter of another name, or to compute its value, write `=> field: value` on the same line.
 //! 2. Add the field to the algorithm's parameters.
 //! 3. Run `packwatch check --reference > docs/src/reference/keys.md`. A test fails if this page is out of date.
 //!

@@ -55,8 +55,8 @@ impl ControlClient {
         let mut stream = UnixStream::connect(&self.path)?;
         stream.set_read_timeout(Some(patience(request)))?;
         stream.set_write_timeout(Some(PATIENCE))?;
-        // If the daemon has no free slot, it sends an error and closes the connection, so writing may fail. The error
-        // is read even then.
+        // If the daemon has no free slot, it sends an error and closes the connection, so writing may fail. Even then,
+        // the error that the daemon sent is read.
         let written = stream.write_all(request.to_line().as_bytes());
         let mut line = Vec::new();
         BufReader::new(stream.take(MAX_ANSWER_BYTES)).read_until(b'\n', &mut line)?;

@@ -1,15 +1,15 @@
 //! Decides who may read: every local user, or clients that know the token.
 //!
-//! | address | without a token | with a token |
+//! | address | no token is configured | a token is configured |
 //! | --- | --- | --- |
-//! | loopback | everything | everything, with the token |
-//! | any other | metrics only | everything, with the token |
+//! | loopback | everything | everything, if the client sends the token |
+//! | any other | metrics only | everything, if the client sends the token |
 //!
 //! A client sends the token as `Authorization: Bearer TOKEN`, or once as `?token=TOKEN`. In the second case the answer
 //! sets a cookie and redirects to the address without the token, so that the token does not stay in the browser's
 //! history. The liveness check needs no token.
 //!
-//! Without a token, the request must name this computer ([`names_this_computer`]).
+//! If no token is configured, the requests for anything but metrics must name this computer ([`names_this_computer`]).
 
 use std::fs;
 use std::hint::black_box;
@@ -52,7 +52,7 @@ impl Access {
         Ok(Self { token, is_local: address.to_canonical().is_loopback() })
     }
 
-    /// Whether the page is served. On a network address, it is served only with a token.
+    /// Whether the page is served. On a network address, it is served only if a token is configured.
     pub(super) fn has_page(&self) -> bool {
         self.is_local || self.token.is_some()
     }

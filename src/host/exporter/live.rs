@@ -1,8 +1,10 @@
-//! The daemon's status as server-sent events. One connection to the daemon's stream serves all clients.
+//! Sends the daemon's status to HTTP clients as server-sent events. One connection to the daemon's stream serves all
+//! clients.
 //!
-//! Input: lines of the stream. Output per client: one event `history` with the last hour, then each document as an event
-//! without a name, or the event `gone` while the daemon is silent. A client that is slower than the daemon misses
-//! documents. A client that takes no event within [`SILENCE`] is disconnected.
+//! Input: lines of the stream, one status document each. Output per client: first one event `history` with the last
+//! hour, then each document as an event without a name. While the daemon is silent, the client gets the event `gone`
+//! instead of documents. A client that is slower than the daemon misses documents. A client that takes no event within
+//! [`SILENCE`] is disconnected.
 
 use std::cell::RefCell;
 use std::collections::VecDeque;

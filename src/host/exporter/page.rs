@@ -35,8 +35,8 @@ pub(super) fn answer(template: &str) -> (String, String) {
     (template.replace(NONCE, &nonce), policy)
 }
 
-/// The names and units that the page shows. The page takes the scale, the decimals and the unit from sample texts: a
-/// rule's value 1, and a finding of the size 1 ± 1.
+/// The names and units that the page shows. For each rule and each kind of finding, the catalogue has a sample text (a
+/// value of 1, or a finding of the size 1 ± 1). The page takes the scale, the decimals and the unit from this text.
 fn catalogue(has_report: bool) -> Value {
     let row = |(row, shown): (&'static QuantityRow, &'static Presentation)| {
         json!([row.key, row.std_key, row.unit.symbol(), shown.mqtt_name, shown.about])

@@ -1,8 +1,8 @@
 //! Writes a file on a separate thread, so that a slow disk never delays the daemon's loop.
 //!
 //! Bytes are collected and sent to the thread in pieces. A piece cannot be sent if the thread failed to write an
-//! earlier piece, or if too many pieces wait for a slow disk. In both cases `write` or `flush` returns an error, and
-//! the caller gives up the file and continues.
+//! earlier piece, or if too many pieces wait for a slow disk. Then `write` or `flush` returns an error. The caller
+//! stops writing this file and continues without it.
 
 use std::fs::File;
 use std::io::{self, Write};
@@ -20,8 +20,8 @@ const PIECE_BYTES: usize = 64 * 1024;
 /// Maximum number of waiting pieces. They hold 4 MB, which is ten seconds of a full 1 Mbit/s bus.
 const MAX_PIECES: usize = 64;
 
-/// Maximum wait for the last bytes when the file is finished. It is half of the time after which systemd kills the
-/// service.
+/// Maximum wait for the last bytes when the file is finished. It is half of the time after which systemd kills a
+/// service that does not stop.
 pub const MAX_FINISH: Duration = Duration::from_secs(5);
 
 /// A file and the thread that writes it.

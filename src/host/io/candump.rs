@@ -4,8 +4,9 @@
 //! a line is `(1700000000.123456) can0 123#1122`. The parser also accepts nanosecond and relative stamps, interface
 //! names padded with spaces, the direction that `candump -x` appends, and the drop counts that `candump -d` writes. It
 //! accepts remote frames, raw length codes, CAN FD, error frames, and bytes separated by dots. CAN XL is recognised but
-//! not decoded. Like canplayer, the parser ignores all other lines that do not begin with `(` ([`Line::Other`]). If a
-//! line begins with `(` and violates the grammar, the result is a [`LineError`], which states the column.
+//! not decoded. Except for drop counts, the parser ignores lines that do not begin with `(`, as canplayer does
+//! ([`Line::Other`]). If a line begins with `(` and violates the grammar, the result is a [`LineError`], which states
+//! the column.
 //!
 //! If a CAN FD payload has a length that FD frames cannot have, the parser pads it with zeros to the next valid length,
 //! as canplayer does.

@@ -5,9 +5,10 @@
 //! (NTP, a clock set by hand). The origin of the adapter's clock is arbitrary. [`StampMapper`] converts both kinds of
 //! stamps to the program's clock:
 //!
-//! * A software stamp becomes `stamp - (realtime - boottime)`. This difference is measured when the frame is read.
-//!   Around a step of the clock, the difference from before the step is also tried. If both times are plausible, the
-//!   later one is used. If neither is plausible, the time of reading replaces the stamp.
+//! * A software stamp becomes `stamp - (realtime - boottime)`. The difference `realtime - boottime` is measured when
+//!   the frame is read. If CLOCK_REALTIME has just stepped, the difference from before the step gives a second
+//!   candidate. If both candidates are plausible, the later one is used. If neither is plausible, the time of reading
+//!   replaces the stamp.
 //! * A time is plausible if it is not after the reading of the frame, and not before the socket was last found empty
 //!   (with a small tolerance). The length of this interval bounds the error of any stamp.
 //! * A hardware stamp becomes `stamp + offset`. The offset is the smallest recent value of `arrival - stamp`, because
@@ -318,7 +319,7 @@ mod tests {
         for reading in [reading_with_waits(&[]), reading_with_waits(&busy), reading_with_waits(&[0, MS])] {
             assert_eq!(reading.offset_ns(), OFFSET, "{reading:?}");
         }
-        // If the processor is always busy, the closest calls are used.
+        // If the processor is always busy, the attempt with the closest readings is used.
         let reading = reading_with_waits(&[0, MS, MS, 0, 9 * MS, MS, 0, MS, 0, 0, 9 * MS, MS]);
         assert!((reading.offset_ns() - OFFSET).abs() <= MS / 2, "{reading:?}");
     }

@@ -2,11 +2,11 @@
 //! CSV.
 //!
 //! In: a table and the options. Out: rows of values in packwatch's units; a positive current is a discharge. The
-//! columns are found by name in a [dictionary](dictionary), or the user names them. Units come from the header, from
-//! a second header row, or from the user. From the first rows, [judge] finds the sign of the current and units that
-//! the header does not state. It rejects values that cannot be in the stated unit. An empty or missing field, `-` and
-//! `n/a` mean "no reading". A row is bad if its time cannot be read, or if another field is neither a finite number
-//! nor one of these.
+//! columns are found by name in a [dictionary](dictionary), or the user names them. Units come from the header, from a
+//! second header row, or from the user. From the first rows, [judge] finds the sign of the current and units that the
+//! header does not state. It rejects values that cannot be in the stated unit. An empty or missing field, `-` and `n/a`
+//! mean "no reading". A row is bad if its time cannot be read. It is also bad if another field is not a finite number
+//! and does not mean "no reading".
 //!
 //! A section column (`cycle`, `segment`, `ref`, or the column that the user names) divides a file into sections. Time
 //! restarts in each section. If a table states the start times of the sections, the times are absolute. Otherwise,

@@ -1,5 +1,5 @@
-//! Writes core events as log lines with fields. The kind of an event decides its log level; for an alarm, the severity
-//! also counts. Error frames, lost frames and unsent frames are logged once and then as counts, because a bus without
+//! Writes core events as log lines with fields. The kind of an event decides its log level. For an alarm, the severity
+//! decides too. Error frames, lost frames and unsent frames are logged once and then as counts, because a bus without
 //! another node causes thousands of error frames per second. In the JSON format, every event is written.
 
 mod text;
@@ -44,7 +44,7 @@ pub fn write_head(out: &mut impl Write, vehicle: &VehicleIdentity) -> io::Result
 struct EventSum {
     reported: Option<Timestamp>,
     unreported: u64,
-    /// Minimum time between the latest log line and the next log line (s).
+    /// Minimum time between two log lines (s).
     period_s: f64,
 }
 

@@ -18,8 +18,8 @@ use read_ahead::ReadAhead;
 /// bytes.
 const BLOCK: usize = 256 * 1024;
 
-/// Maximum number of lines per byte of a compressed log. Logs of parked vehicles have up to 7 lines per byte, because
-/// each line has its own time. A file of line feeds has 30,000 lines per byte.
+/// Maximum number of lines per byte of a compressed log. In a log, each line has its own time, so even logs of parked
+/// vehicles have at most 7 lines per byte. A file that contains only line feeds has 30,000 lines per byte.
 const MAX_LINES_PER_BYTE: u64 = 50;
 /// A compressed file smaller than this (bytes) may have as many lines as a file of this size.
 const MIN_PACKED: u64 = 4096;

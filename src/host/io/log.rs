@@ -62,7 +62,7 @@ pub struct LogCounts {
     pub frames: u64,
     /// Lines and parts that violate their format, and files with a damaged end.
     pub bad_lines: u64,
-    /// The first bad line or part: file, place, found and allowed.
+    /// The first bad line or part: file, place, what was found, and what is allowed.
     pub first_bad_line: Option<String>,
     /// Lines without a record, such as headers, comments and blank lines.
     pub ignored_lines: u64,
@@ -252,7 +252,8 @@ impl LogSource {
     /// end of the last log, returns `false`; the batch is then empty.
     ///
     /// # Errors
-    /// Fails like [`next_record`](Self::next_record). Earlier calls have then returned all records before the error.
+    /// Fails like [`next_record`](Self::next_record). In that case, earlier calls have already returned all records
+    /// that precede the error.
     pub fn next_batch(&mut self, batch: &mut Batch) -> Result<bool, LogError> {
         batch.len = 0;
         if let Some(open) = &mut self.current

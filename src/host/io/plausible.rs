@@ -1,8 +1,8 @@
 //! Judges whether readings are in their assumed units.
 //!
-//! In: times (s), currents (A) and voltages of a cell (V), which may be wrong by a factor. Out: an [`Implausible`]
-//! that names what is wrong and the unit that the values probably have. The rules state what no cell can do, not what
-//! a usual cell does. All other readings pass. NaN means "no reading".
+//! In: times (s), currents (A) and voltages of a cell (V), which may be wrong by a factor. Out: an [`Implausible`] that
+//! names what is wrong and the unit that the values probably have. The rules reject only readings that no cell can
+//! cause; unusual readings pass. NaN means "no reading".
 
 /// Maximum plausible current, as a multiple of the capacity per hour.
 const MAX_C_RATE: f64 = 100.0;
@@ -23,15 +23,15 @@ const RESISTANCE_CAPACITY: (f64, f64) = (0.000_5, 20.0);
 /// Minimum number of current steps for a judgement on the resistance or the sign.
 const MIN_STEPS: usize = 10;
 
-/// If a larger share of the readings is beyond a limit, the table is in the wrong unit. A smaller share consists of
+/// If a larger share of the readings is beyond a limit, the table is in the wrong unit. A smaller share counts as
 /// faults of single readings.
 const MAX_SHARE: f64 = 0.01;
 
 /// Maximum plausible charge that a cell gives or takes in one direction, as a multiple of its capacity.
 const MAX_CAPACITIES: f64 = 3.0;
 
-/// Maximum plausible change of the mean voltage, relative to the charge (V per capacity). At the ends of its curve, a
-/// cell reaches 30.
+/// Maximum plausible change of the mean voltage, relative to the charge that has moved (V per full capacity). At the
+/// ends of its curve, a cell reaches 30.
 const MAX_SLOPE_V: f64 = 40.0;
 
 /// Last plausible date: 2100-01-01 (s since 1970).
@@ -74,7 +74,8 @@ pub fn probable_stamp_unit(seconds: f64) -> Option<&'static str> {
     is_past.then(|| units.into_iter().find(|(factor, _)| seconds.abs() / factor <= LAST_DATE_S).map_or("ns", |of| of.1))
 }
 
-/// Probable unit of times that would advance by `step_s` as seconds, but cannot be seconds.
+/// Returns the probable unit of times that cannot be in seconds. `step_s`: typical step between rows if the times are
+/// read as seconds.
 fn probable_step_unit(step_s: f64) -> &'static str {
     // Rows are usually at most 100 s apart.
     [(1e3, "ms"), (1e6, "us")].into_iter().find(|(factor, _)| step_s / factor <= 100.0).map_or("ns", |of| of.1)
@@ -204,13 +205,15 @@ pub fn check_charge(time_s: &[f64], current_a: &[f64], capacity_ah: f64) -> Resu
         "the current moves {span_ah:.0} Ah one way, but the rated capacity is {capacity_ah} Ah (it must include all \
          parallel cells)"
     );
-    // Rows are rarely less than 20 ms apart.
+    // If the steps are at least 20, the times are probably in ms or a smaller unit, because rows are rarely less than
+    // 20 ms apart.
     let probable = median_step(time_s).filter(|step_s| *step_s >= 20.0).map(probable_step_unit);
     implausible("time", probable, what)
 }
 
-/// Checks that enough charge flows to change the mean voltage from one tenth of the rows to another. Only tenths with
-/// a mean current of the same sign are compared, because after a load the voltage recovers without a charge.
+/// Compares the mean voltages of tenths of the rows, and checks that enough charge flows between two tenths to explain
+/// the change. Only consecutive tenths with mean currents of the same sign are compared, because the voltage recovers
+/// after a load even without a charge.
 ///
 /// # Errors
 /// The voltage changes by more than 40 V per capacity.
@@ -303,8 +306,8 @@ fn steps(time_s: &[f64], current_a: &[f64], voltage_v: &[f64]) -> Vec<(f64, f64)
     near.map(|pair| (pair[1][1] - pair[0][1], pair[1][2] - pair[0][2])).collect()
 }
 
-/// For each stretch of constant current, whether a positive current discharges. The voltage must change by at least
-/// 100 mV.
+/// For each stretch of constant current, whether a positive current means discharge. The voltage must change by at
+/// least 100 mV.
 fn plateaus(current_a: &[f64], voltage_v: &[f64], largest: f64) -> Vec<bool> {
     const MIN_ROWS: usize = 20;
     const SETTLING_ROWS: usize = 5;
@@ -401,7 +404,7 @@ mod tests {
         let cycles: Vec<f64> = (0..40_000).map(|n| if n / 100 % 2 == 0 { 1.5 } else { -1.47 }).collect();
         assert!(check(&minutes, &vec![0.1; 40_000]) && check(&minutes, &cycles));
         assert!(check(&[0.0, 60.0, 120.0, 360_000.0, 360_060.0], &[3.0; 5]) && !check(&minutes, &vec![1.0; 40_000]));
-        // A discharge in an hour. The file states the time in minutes, but it is read as seconds.
+        // A discharge of one hour. The file states the time in minutes, but the time is read as seconds.
         let (time, current) = ((0..60).map(f64::from).collect::<Vec<_>>(), [3.0; 60]);
         let voltage: Vec<f64> = time.iter().map(|time| 4.1 - time / 60.0).collect();
         let slope =

@@ -1,7 +1,8 @@
-//! Writes the result files of a command. A file is written completely or not at all, and every failure is reported.
+//! Writes the result files of a command. A regular file is written completely or not at all. If a write fails, the
+//! error names the file.
 //!
 //! A regular file is written as `NAME.part` in the same folder and renamed when it is complete. If the command fails,
-//! `NAME.part` is deleted. `-` is standard output. A device or pipe is written directly.
+//! `NAME.part` is deleted. The path `-` means standard output. A device or pipe is written directly.
 
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Seek, SeekFrom, Write};

@@ -1,5 +1,5 @@
-//! Writes and finds recordings in segments, which are compressed parts of one text. If their total size exceeds a
-//! limit, the oldest segments are deleted.
+//! Writes a recording as segments: compressed files that together contain one text. Also finds the segments of a
+//! recording. If the total size of the segments exceeds a limit, the oldest segments are deleted.
 //!
 //! `FILE` is written as `FILE.000001.zst`, `FILE.000002.zst` and so on. Each segment is a complete zstd frame of
 //! whole lines, and begins with the text's header, so it can be read alone. Read one after another, the segments give
@@ -168,7 +168,7 @@ pub(super) struct SegmentWriter {
 
 impl SegmentWriter {
     /// Renames the segments of an earlier run and starts the first segment. The text that the caller writes must begin
-    /// with `header`; every later segment gets its own `header`.
+    /// with `header`. The writer itself begins every later segment with `header`.
     ///
     /// # Errors
     /// Fails if a file cannot be renamed, deleted or created.
@@ -227,8 +227,8 @@ fn begin(path: &Path) -> io::Result<Encoder<'static, CountedFile>> {
     Encoder::new(CountedFile { file: File::create(path)?, bytes: 0 }, 1)
 }
 
-/// Renames the segments of the last run to `base.1` after deleting that name's old segments. Returns the renamed
-/// segments with their sizes.
+/// Renames the segments of the last run to `base.1`. Before this, deletes the older segments that have this name.
+/// Returns the renamed segments with their sizes.
 fn keep_earlier(base: &Path) -> io::Result<VecDeque<(PathBuf, u64)>> {
     let earlier = with_suffix(base, ".1");
     for segment in find(&earlier)? {

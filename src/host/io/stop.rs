@@ -1,4 +1,4 @@
-//! Waits for a signal that would end the process, so that a program can stop cleanly, or for a set time.
+//! Waits for a set time, or for a signal that would otherwise end the process, so that a program can stop cleanly.
 
 use std::future::poll_fn;
 use std::io;
@@ -9,9 +9,9 @@ use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::oneshot;
 use tokio::time::{Instant, sleep_until};
 
-/// Numbers of further signals that end a process by default, without the signals of crashes: SIGQUIT, SIGUSR1,
-/// SIGUSR2, SIGALRM, SIGSTKFLT, SIGXCPU, SIGVTALRM, SIGPROF, SIGIO, SIGPWR (Linux, except MIPS) and the signals for
-/// applications. The C library reserves the first real-time signals. They cannot be caught and are skipped.
+/// Numbers of further signals that end a process by default, without the signals of crashes: SIGQUIT, SIGUSR1, SIGUSR2,
+/// SIGALRM, SIGSTKFLT, SIGXCPU, SIGVTALRM, SIGPROF, SIGIO, SIGPWR (Linux, except MIPS) and the real-time signals. The C
+/// library reserves the first real-time signals: they cannot be caught and are skipped.
 const OTHERS: [std::ops::RangeInclusive<i32>; 9] =
     [3..=3, 10..=10, 12..=12, 14..=14, 16..=16, 24..=24, 26..=27, 29..=30, 34..=64];
 /// SIGXFSZ. If it is caught, a write that exceeds the limit fails like any other write, and the daemon continues.
@@ -25,7 +25,7 @@ pub struct Stop {
 }
 
 impl Stop {
-    /// Catches the signals. Must be called inside the runtime.
+    /// Catches the signals. Must be called inside the tokio runtime.
     pub fn new(duration: Option<Duration>) -> io::Result<Self> {
         let catch = |kind: SignalKind| signal(kind).map(|caught| (kind.as_raw_value(), caught));
         let mut signals = vec![catch(SignalKind::terminate())?, catch(SignalKind::interrupt())?];

@@ -347,7 +347,7 @@ impl Header {
         names.iter().find_map(|name| self.find(name))
     }
 
-    /// Index of the first of these columns that the table has.
+    /// Index of the first of these columns that the table has; an error if it has none of them.
     pub fn required(&self, names: &[&str]) -> Result<usize, TableError> {
         let missing = || self.fault(format!("no column {}, found {}", names.join(" or "), self.listed()));
         self.find_any(names).ok_or_else(missing)
@@ -402,7 +402,8 @@ impl<'t> Row<'t> {
         if value.is_some() || !self.header.has_decimal_comma || !field.contains(&b',') {
             return value;
         }
-        // Read a decimal comma. Several commas separate thousands, which is not a number here.
+        // Read a comma as a decimal comma. A text with several commas (thousands separators) does not count as a number
+        // here.
         parse_field(&field.iter().map(|&byte| if byte == b',' { b'.' } else { byte }).collect::<Vec<_>>())
     }
 

@@ -4,11 +4,11 @@
 //! awake. A plain log only states when frames arrived. This module generates the same ticks for a plain log, at
 //! multiples of the period. A tick at time T comes after every record of time T and before the first later record.
 //!
-//! After each record, the recorder counts as awake for the duration of the sleep gap, even if the next record arrives
+//! After each record, the recorder counts as awake for a fixed time, the sleep gap, even if the next record arrives
 //! later. The ticks in this time let the core detect a lost input, as the daemon does on a silent bus. When the sleep
 //! gap has passed, the recorder counts as asleep, and the ticks stop. The first record of the log and the first record
-//! after sleep wake the recorder, which gives one tick with the time of that record. The ticks end with the log's last
-//! record.
+//! after sleep wake the recorder. When the recorder wakes, there is one tick with the time of that record. The ticks
+//! end with the log's last record.
 //!
 //! The caller passes the time of the core's next necessary tick ([`Ticks::pop`]'s `due`). Earlier ticks are skipped
 //! because they would change nothing.
@@ -26,7 +26,7 @@ pub struct Ticks {
     limit_ns: i64,
     /// Time of the latest record; `None` before the first record and after [`Ticks::sleep`].
     latest_ns: Option<i64>,
-    /// Time of the tick with which the recorder wakes. This tick is popped after the ticks before the gap.
+    /// Time of the tick with which the recorder wakes. The ticks that precede the gap are popped before this tick.
     wake_ns: Option<i64>,
 }
 

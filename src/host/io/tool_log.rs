@@ -24,8 +24,8 @@ impl ToolLog {
     pub(super) fn recognise(lines: &mut Lines) -> io::Result<Option<Format>> {
         let first = lines.peek()?;
         if first.starts_with(b"PACKWATCH-JOURNAL") || begins_with_unix_stamp(first) {
-            // This is a journal or a candump log. Return early, because a live source may take long to send a whole
-            // head.
+            // This is a journal or a candump log. Return early: a live source may need a long time to send as many
+            // bytes as the other formats need to be recognised.
             return Ok(None);
         }
         let head = lines.peek_bytes(Format::HEAD_BYTES)?;

@@ -112,7 +112,7 @@ impl Unit {
         let mut plain: String = text.trim().to_lowercase().replace(['\u{b5}', '\u{3bc}'], "u");
         plain = plain.replace('\u{2103}', "c").replace('\u{2109}', "f");
         plain.retain(|c| !matches!(c, ' ' | '.' | '\u{b7}' | '*' | '^'));
-        // The degree sign in UTF-8, as an ordinal indicator, and as a byte of another encoding.
+        // The degree sign, the similar ordinal indicator, and two characters that appear if the encoding is wrong.
         for (sign, ends) in [('\u{b0}', ""), ('\u{ba}', ""), ('\u{f8}', ""), ('\u{fffd}', "cfk")] {
             if let Some(rest) = plain.strip_prefix(sign).or_else(|| plain.strip_prefix(&format!("\u{c2}{sign}")))
                 && (ends.is_empty() || (rest.len() == 1 && ends.contains(rest)))
@@ -176,7 +176,7 @@ mod tests {
             let found = Unit::find(text).unwrap_or_else(|| panic!("{text} is known")).convert(value);
             assert!((found - expected).abs() < 1e-9, "{text}: {found}");
         }
-        // A lost character in front of an s may be a micro sign.
+        // A lost character in front of an s may be a micro sign, so the unit is unknown.
         assert!(Unit::find("\u{fffd}s").is_none() && Unit::find("W").is_none() && Unit::find("").is_none());
         assert!(is_clock("h:min:s.ms") && !is_clock("s"));
     }

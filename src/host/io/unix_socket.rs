@@ -101,11 +101,11 @@ impl From<io::Error> for BindError {
 }
 
 impl BindError {
-    /// Decides whether the server with option `--OPTION` continues without its socket. If so, logs the reason and
-    /// returns `None`.
+    /// Decides whether the daemon continues without this socket. If it continues, logs the reason and returns `None`.
+    /// `option` is the name of the command-line option that sets the socket's path.
     ///
     /// # Errors
-    /// Fails if another daemon uses the socket, or the socket is required.
+    /// Fails if another daemon uses the socket, or if the socket is required (`is_needed`).
     pub fn without_socket<T>(self, path: &Path, is_needed: bool, option: &str) -> Result<Option<T>, String> {
         let shown = path.display();
         match self {

@@ -16,7 +16,8 @@ use tracing_subscriber::layer::{Context, Layer};
 use super::note_left_out;
 
 const SOCKET: &str = "/run/systemd/journal/socket";
-/// Longest value, bytes. Longer values are cut. An entry with a few values of this length fits into a datagram.
+/// Maximum length of a value, bytes. Longer values are cut, so that an entry with a few such values fits into a
+/// datagram.
 const MAX_VALUE: usize = 8 * 1024;
 /// Permanent ids of messages that programs search for (`journalctl MESSAGE_ID=...`), by their text.
 const MESSAGE_IDS: [(&str, &str); 3] = [
@@ -38,8 +39,8 @@ impl Journal {
     pub(super) fn new() -> io::Result<Self> {
         let socket = UnixDatagram::unbound()?;
         socket.set_nonblocking(true)?;
-        // journald ignores an empty datagram. If journald does not listen, sending fails. If journald's queue is full
-        // (`WouldBlock`), journald listens.
+        // journald ignores an empty datagram. If journald does not listen, sending fails. The error `WouldBlock` means
+        // that journald listens and its queue is full.
         match socket.send_to(&[], SOCKET) {
             Err(error) if error.kind() != ErrorKind::WouldBlock => Err(error),
             Ok(_) | Err(_) => Ok(Self { socket }),

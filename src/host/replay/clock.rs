@@ -57,7 +57,8 @@ pub(super) struct RecordSpan {
     sleep_gap_ns: i64,
     pub(super) first: Option<Timestamp>,
     pub(super) latest: Option<Timestamp>,
-    /// Covered time without gaps longer than the sleep gap. Nanoseconds keep the sum of millions of steps exact.
+    /// Covered time, without the gaps that are longer than `sleep_gap_ns`. Nanoseconds keep the sum of millions of
+    /// steps exact.
     awake_ns: i64,
     /// Number of records with a later stamp than all records before them, and how many of them follow a sleep gap.
     steps: u64,
@@ -94,7 +95,7 @@ impl RecordSpan {
         asleep
     }
 
-    /// Number of records that follow a sleep gap, and number of all records with a later stamp than before.
+    /// The fields `gaps` and `steps`.
     pub(super) fn gaps_and_steps(&self) -> (u64, u64) {
         (self.gaps, self.steps)
     }

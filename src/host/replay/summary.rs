@@ -52,7 +52,7 @@ pub struct ReplaySummary {
     pub first_s: Option<f64>,
     /// Last stamp (s).
     pub last_s: Option<f64>,
-    /// Covered time without gaps longer than the sleep gap (s).
+    /// Covered time (s), without gaps in which the recorder counts as asleep.
     pub awake_s: f64,
     /// Wall time (s).
     pub wall_s: f64,

@@ -57,7 +57,7 @@ pub(super) struct Engine {
     pub(super) recent: RecentEvents,
     /// Progress of the store; `None` = no progress was reported.
     progress: Option<StoreProgress>,
-    /// Number of times that results were announced before they were stored.
+    /// Number of times that results were announced (sent in frames) before they were stored, because the disk was slow.
     late: u64,
 }
 
@@ -253,7 +253,8 @@ impl Engine {
         }
     }
 
-    /// If frames are authenticated, stores the state at the start. The caller must not send frames before this call.
+    /// If frames are authenticated, stores the state at the start, so that a later start cannot use the same freshness
+    /// counter again. The caller must not send frames before this call.
     pub(super) fn store_start(&mut self, time: Timestamp) {
         if self.key.is_some()
             && let Some(store) = &mut self.store

@@ -1,7 +1,8 @@
-//! Logs that packwatch runs its own J1939 stack on raw CAN, so that a replay produces the same frames. For users who
-//! look for the node in the kernel, the log line states whether the kernel's own stack is loaded.
+//! Logs which J1939 stack is in use. packwatch runs its own stack on raw CAN, because a replay then produces the same
+//! frames. The log line also states whether the kernel's stack is loaded, for users who look for packwatch's node
+//! there.
 
-/// Logs one line. A kernel that loads its J1939 stack on first use lists the stack only after that use.
+/// Logs one line. If the kernel loads its J1939 stack only at the first use, the line says "not loaded" until then.
 pub(super) fn log_kernel_stack() {
     let kernel_stack = stack_state(std::fs::read_to_string("/proc/net/protocols").ok().as_deref());
     tracing::info!(kernel_stack, "J1939 runs in packwatch over raw CAN, not in the kernel");

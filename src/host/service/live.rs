@@ -28,12 +28,13 @@ use crate::store::StoreProgress;
 /// tick.
 const BATCH: usize = 256;
 /// If the loop has not run for longer than this time, its process was stopped (by SIGSTOP or a debugger), or the
-/// computer was overloaded. The sockets then hold frames of a long time, which must be merged before they are handled.
-/// The limit equals the largest step back in time that the core accepts from frames merged out of order.
+/// computer was overloaded. The sockets then hold frames of a long time, which must be sorted by time before the core
+/// receives them. Below this limit, sorting is unnecessary: the core accepts frames that are late by up to
+/// [`MERGE_TOLERANCE_NS`].
 const MAX_PAUSE_NS: i64 = MERGE_TOLERANCE_NS;
 /// Pause between two attempts to collect the frames that arrived during a stop.
 const MERGE_ROUND: Duration = Duration::from_millis(10);
-/// Maximum number of attempts. Collecting ends earlier if an attempt finds no frame from the time of the stop.
+/// Maximum number of these attempts. Collecting ends earlier if an attempt finds no frame from the time of the stop.
 const MERGE_ROUNDS: usize = 100;
 /// Maximum number of records that are merged after a stop. All sockets together hold fewer.
 const MAX_MERGED: usize = 1 << 20;
@@ -82,8 +83,8 @@ impl ServiceLoop {
                         notify(&[NotifyState::Watchdog]);
                         fed = now;
                     }
-                    // The files are flushed every second, so that a crash of the daemon loses at most the last second
-                    // of these files.
+                    // The output files are flushed every second, so that a crash of the daemon loses at most their last
+                    // second.
                     if now.duration_since(flushed) >= Duration::from_secs(1) {
                         self.engine.flush();
                         self.log_clock_step();
@@ -195,7 +196,8 @@ impl ServiceLoop {
     }
 
     /// If the process was stopped, collects everything that has arrived on all interfaces since then. The core then
-    /// receives these frames in order of time and before the present tick, so that its time does not go backwards.
+    /// receives these frames in order of time and before the present tick, so that the core's time does not go
+    /// backwards.
     async fn merge_after_stop(&mut self) {
         if self.clock.now().nanos() - self.ticked.nanos() <= MAX_PAUSE_NS {
             return;

@@ -2,13 +2,13 @@
 //! commands, authentication and polling. The store is in a temporary folder, in memory if possible.
 //!
 //! A simulated run is called a life. Its seed determines the whole life. Faults are lost, repeated and foreign frames,
-//! silence, bus events, clock steps, stops of hours, clean ends, and kills at any step, even before a commit reaches
-//! the disk. Bytes in the stored files are flipped, and files are deleted or replaced while the process runs. Every
-//! step checks the estimates, the sent frames and the store. A failure prints the seed and the step; `PACKWATCH_SEED`
-//! repeats the life.
+//! silence, bus events, clock steps, pauses of up to two hours, clean ends, and kills at any step, even before a commit
+//! reaches the disk. Bytes in the stored files are flipped, and files are deleted or replaced while the process runs.
+//! Every step checks the estimates, the sent frames and the store. A failure prints the seed and the step;
+//! `PACKWATCH_SEED` repeats the life.
 //!
-//! The folder is in a real file system, so writes are neither reordered nor torn. `tests/vcan` cuts the power of a
-//! simulated disk.
+//! The folder is in a real file system, so this test never sees reordered or torn writes. The power-cut tests in
+//! `tests/vcan` cause them on a simulated disk.
 
 mod nodes;
 
@@ -62,7 +62,7 @@ struct World {
     withheld: Vec<Frame>,
     /// Steps until the recorded commands are sent.
     replay_in: u32,
-    /// Highest freshness of all sent frames.
+    /// Highest freshness (number against replayed frames, see SecOC) of all sent frames.
     freshness: u64,
     /// Number of history rows that the store has confirmed.
     rows: i64,

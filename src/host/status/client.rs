@@ -1,4 +1,4 @@
-//! Client of the status socket. It reads one document and blocks for a limited time.
+//! Client of the status socket. It reads one status document and waits for it at most [`PATIENCE`].
 
 use std::io::{self, ErrorKind, Read};
 use std::os::unix::net::UnixStream;
@@ -11,7 +11,7 @@ use super::document::{StatusDocument, VERSION};
 use super::{MAX_SILENCE, standard_path};
 use crate::io::unix_socket::explain_no_daemon;
 
-/// Longest wait. This is one second longer than a daemon waits for a fresh document.
+/// Longest wait for a document. It is one second longer than the daemon itself waits for a new document.
 pub const PATIENCE: Duration = Duration::from_secs(1 + MAX_SILENCE.as_secs());
 /// Longest document, bytes. A document with 1,024 cells and as many alarms takes less than 1 MB.
 pub const MAX_DOCUMENT_BYTES: usize = 8 << 20;

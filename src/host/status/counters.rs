@@ -37,7 +37,8 @@ impl Default for Latency {
 }
 
 impl Latency {
-    /// Counts one frame. The two stamps of a latency may come from different clocks. A negative latency counts as zero.
+    /// Counts one frame. The two stamps of a latency may come from different clocks, so the latency may be negative. It
+    /// then counts as zero.
     #[inline]
     pub fn record(&mut self, seconds: f64) {
         let seconds = seconds.max(0.0);
@@ -49,8 +50,8 @@ impl Latency {
         self.sum_s += seconds;
     }
 
-    /// Returns the lowest bucket bound (s) that at least the fraction `share` of all frames did not exceed. `None` = no
-    /// frame was counted, or too many frames are in the last, unbounded bucket.
+    /// Returns the lowest bucket bound (s) for which at least the fraction `share` of all frames had a latency up to
+    /// this bound. `None` = no frame was counted, or too many frames are in the last, unbounded bucket.
     pub fn quantile_s(&self, share: f64) -> Option<f64> {
         let wanted = (share * self.frames as f64).ceil().max(1.0);
         let mut so_far = 0;

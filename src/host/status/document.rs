@@ -87,7 +87,7 @@ pub struct StatusDocument {
     /// Findings about cells and sensors, in the format of `--events`.
     #[serde(default)]
     pub findings: Vec<CellFault>,
-    /// Latency from the kernel's receive stamp of a frame to its estimate.
+    /// Latency from the kernel's receive time stamp of a frame to the estimate that uses the frame.
     pub latency: Latency,
     /// The store of state and history; `None` = disabled.
     pub store: Option<StoreStatus>,
@@ -96,7 +96,7 @@ pub struct StatusDocument {
     #[serde(default)]
     pub event_count: u64,
     /// The latest events, oldest first, in the format of `--events`. Events that occur once per cell and half-cycle are
-    /// left out. The list has 32 events, or more if more occurred in the last 5 s (at most 1,024).
+    /// left out. The list has 32 events, or more if more than 32 occurred in the last 5 s (at most 1,024).
     pub events: Vec<serde_json::Value>,
 }
 
@@ -162,7 +162,7 @@ pub struct AlarmStatus {
     pub raised: usize,
     /// Highest severity of the raised alarms.
     pub highest_severity: Option<Severity>,
-    /// Thresholds with alarms that cannot be evaluated because their value is unknown.
+    /// Thresholds whose alarms cannot be evaluated because a value is unknown.
     pub unknown: Vec<UnknownAlarms>,
     /// Alarms that are raised, about to be raised, or not yet acknowledged.
     pub list: Vec<Alarm>,
@@ -185,13 +185,15 @@ impl AlarmStatus {
 }
 
 /// Counters. Except for `lifetime`, all counters start at 0 when the program starts, including the counters of
-/// interfaces, protected messages, controllers and floods. They do not continue from stored counts, because a stored
-/// count may be a minute old after a power cut. Readers that sum differences need counters that never decrease.
+/// interfaces, protected messages, controllers and floods. They do not continue from stored counts: after a power cut,
+/// a stored count may be a minute old, so the counter would decrease. A program that sums the increases of a
+/// counter can handle a restart from 0, but not such a decrease.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct StatusCounters {
     /// Counters of the core.
     pub core: Statistics,
-    /// Counters of the core since the first start, as far as they are stored. The interfaces are not included.
+    /// Counters of the core since the first start; after a power cut, the counts since the last stored state are
+    /// missing. The interfaces are not included.
     #[serde(default)]
     pub lifetime: Statistics,
     /// Readings by outcome.

@@ -105,7 +105,8 @@ fn part(event: &Map<String, Value>, key: &str, value: &Value, document: &StatusD
         return Some(format!("{name} {}", rule.map_or_else(|| number(value), |rule| rule.with_unit(value))));
     }
     Some(match value {
-        // These keys may be missing from a complete event. An event without a cell is about the whole pack.
+        // If one of these keys is null, nothing is unknown. For example, an event without a cell is about the whole
+        // pack.
         Value::Null if ["cell", "chemistry", "seconds"].contains(&key) => return None,
         Value::Null => format!("{name} unknown"),
         Value::Bool(is_so) => {
@@ -134,14 +135,14 @@ fn shown(key: &str, value: &Value, document: &StatusDocument) -> String {
         Value::Number(it) if HEXADECIMAL.contains(&key) => {
             it.as_u64().map_or_else(|| it.to_string(), |it| format!("{it:02X}"))
         }
-        // Readers count from 1.
+        // The index counts from 0, but people count from 1.
         Value::Number(index) if NUMBERED.contains(&key) => (index.as_u64().unwrap_or(0) + 1).to_string(),
         Value::Number(it) if it.is_f64() => number(it.as_f64().unwrap_or(f64::NAN)),
         Value::Object(_) if key == "id" => {
             serde_json::from_value::<CanId>(value.clone()).map_or_else(|_| value.to_string(), |id| id.to_string())
         }
         Value::Object(keys) => {
-            // A selector without a value selects everything.
+            // A selector that is null selects everything, so it is not shown.
             let known = keys.iter().filter(|(_, value)| !value.is_null());
             let parts: Vec<String> = known.filter_map(|(key, value)| part(keys, key, value, document)).collect();
             parts.join(", ")

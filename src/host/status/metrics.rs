@@ -3,9 +3,9 @@
 //! * Units are in the names (`_volts`, `_amperes`, `_celsius`, `_ratio`, `_seconds`, `_amperehours`). Counters end with
 //!   `_total`. Cells count from 1.
 //! * Unknown values are omitted, so a value that is present is valid.
-//! * All counters start at 0 when the daemon starts (see `packwatch_uptime_seconds`). Readers that sum increases expect
-//!   this.
-//! * Without a daemon there is only `packwatch_up 0`.
+//! * All counters start at 0 when the daemon starts (see `packwatch_uptime_seconds`), as Prometheus expects from a
+//!   counter.
+//! * If no daemon answers, the only metric is `packwatch_up 0`.
 
 use std::collections::HashSet;
 use std::fmt;

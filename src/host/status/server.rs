@@ -237,7 +237,7 @@ impl Clients {
             }
             Ok((client, stream)) if self.slots.make_room(&client, std::time::Instant::now()) => {
                 context.count(|counts| counts.served += 1);
-                // A reader is never idle: it waits for the next document.
+                // A client that reads is never idle, because it always waits for the next document.
                 let activity = Activity::new();
                 activity.begin_request();
                 self.slots.take(client, activity, self.tasks.spawn(serve(stream)));
@@ -255,7 +255,7 @@ async fn serve_once(mut client: UnixStream, context: ClientContext, mut latest: 
         latest.wait_for(|published| published.as_ref().is_some_and(|it| it.at.elapsed() < context.limits.stale));
     let line = match timeout(context.limits.max_silence, fresh).await {
         Ok(Ok(published)) => published.as_ref().map(|published| Arc::clone(&published.line)),
-        // The daemon's loop publishes no document, or has ended.
+        // The daemon's loop does not publish documents any more.
         Ok(Err(_)) | Err(_) => None,
     };
     if let Some(line) = line {

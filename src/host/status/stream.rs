@@ -36,7 +36,7 @@ pub async fn follow(socket: &Path, setting: &str, mut handle: impl FnMut(Result<
             tracing::warn!(error, "no status from the daemon");
         }
         was_up = Some(false);
-        // The handler's result matters only for a line, which the handler may reject.
+        // The handler may reject a line, but not an error message, so its result is ignored here.
         let _ = handle(Err(&error));
         sleep(RETRY).await;
     }

@@ -1,8 +1,8 @@
 //! Queues history rows that wait for the disk, in limited memory.
 //!
-//! In: batches of rows. Out: the same batches, oldest first. If there is no room, the oldest half-cycles are dropped
-//! first, because they are details. After the half-cycles, the oldest other rows are dropped, except pack changes.
-//! Dropped rows are counted, and the count is written with the next rows.
+//! In: batches of rows. Out: the same batches, oldest first. If there is no room, the oldest rows of half-cycles (one
+//! charge or discharge of one cell) are dropped first, because they are details. If no half-cycle is left, the oldest
+//! other rows are dropped, except pack changes. Dropped rows are counted, and the count is written with the next rows.
 
 use std::collections::VecDeque;
 
@@ -10,7 +10,7 @@ use super::rows::{HistoryRow, RowBatch};
 use super::stamp::Stamp;
 
 /// Maximum number of rows that wait for the disk. They take half a megabyte of memory. For a pack of 96 cells, they
-/// cover about 25 half-cycles of each cell, that is, days of driving.
+/// hold about 25 half-cycles of each cell, which is several days of driving.
 pub(super) const MAX_ROWS: usize = 5_000;
 
 #[derive(Debug, Default)]
@@ -49,15 +49,15 @@ impl Backlog {
         batches
     }
 
-    /// Confirms that the rows taken last are on disk, including their report of losses.
+    /// Confirms that the rows of the last `take` are on disk, including the row that reports losses.
     pub(super) fn commit(&mut self) {
         let LossCount { details, rows } = std::mem::take(&mut self.reported);
         self.lost.details -= details;
         self.lost.rows -= rows;
     }
 
-    /// Queues rows again after a write has failed. They become the oldest rows. Their report of losses is dropped; the
-    /// next `take` reports the losses again.
+    /// Queues rows again after a write has failed. They become the oldest rows. The row that reports losses is dropped,
+    /// because the next `take` reports the losses again.
     pub(super) fn put_back(&mut self, batches: Vec<RowBatch>) {
         self.reported = LossCount::default();
         let is_loss = |row: &HistoryRow| matches!(row, HistoryRow::Own { reason: "rows_lost", .. });
@@ -68,7 +68,7 @@ impl Backlog {
         self.shrink();
     }
 
-    /// Lost rows that are not yet reported in the history.
+    /// Number of lost rows that the history does not yet report.
     pub(super) fn lost(&self) -> u64 {
         self.lost.details + self.lost.rows
     }

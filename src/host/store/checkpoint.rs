@@ -1,30 +1,30 @@
-//! Decides when the next checkpoint of the state is due. Each checkpoint writes the whole state and wears the flash
-//! memory.
+//! Decides when the next checkpoint is due. A checkpoint writes the whole state of the daemon (what it has learned), so
+//! it wears the flash memory.
 //!
-//! In: the bytes and the time of each commit. Alarm changes and learned results are written at once. The bytes of these
-//! commits delay the next checkpoint. A pack of 96 cells (state of 70 kB) gets a checkpoint every 7 minutes, a pack of
-//! 12 cells every minute.
+//! In: the size and the time of each write to the store. Alarm changes and learned results are written at once, between
+//! the checkpoints. The more bytes they write, the later the next checkpoint is due. A pack of 96 cells (state of
+//! 70 kB) gets a checkpoint every 7 minutes, a pack of 12 cells every minute.
 
 use crate::quantity::Timestamp;
 
-/// Bytes that may be written per day before checkpoints are delayed. In total, 20 MB may be written per day; the rest
-/// is left for bursts of alarms.
+/// Bytes per day above which checkpoints are delayed. Together with bursts of alarms, at most 20 MB may be written per
+/// day.
 const BYTES_PER_DAY: f64 = 15e6;
-/// Bytes that a commit without a state writes. SQLite writes three pages, first to its log and later to its file.
-/// Each write is rounded up to whole pages of the system.
+/// Bytes that a commit without a state writes. SQLite writes three of its pages (1 kB each), first to its log and later
+/// to its database file. Each of these two writes is rounded up to a page of the operating system (4 kB).
 const COMMIT_BYTES: f64 = 8e3;
-/// Bytes that each row adds to a commit, in the log and later in the file of SQLite.
+/// Bytes that each row adds to a commit: the sum of the bytes in SQLite's log and in its database file.
 const ROW_BYTES: f64 = 180.0;
 /// Maximum time without a checkpoint (s), regardless of what else was written.
 const MAX_PERIOD_S: f64 = 3600.0;
 
 #[derive(Debug)]
 pub(super) struct CheckpointSchedule {
-    /// Minimum period (s).
+    /// Minimum time between two checkpoints (s).
     period_s: f64,
     /// Time when the state was last written.
     last: Option<Timestamp>,
-    /// Bytes written beyond the daily rate, and the time at which this number was computed.
+    /// Bytes written in excess of the rate [`BYTES_PER_DAY`], and the time at which this excess was computed.
     ahead: (f64, Timestamp),
 }
 
@@ -33,8 +33,9 @@ impl CheckpointSchedule {
         Self { period_s, last: None, ahead: (0.0, Timestamp::ZERO) }
     }
 
-    /// Whether a checkpoint is due. Since the last state, at least `period_s` and the minimum period of the schedule
-    /// must have passed. For the first checkpoint, the time counts from the first call.
+    /// Whether a checkpoint is due. It is not due before both `period_s` and the schedule's own minimum period have
+    /// passed since the last checkpoint (for the first checkpoint: since the first call). If too many bytes were
+    /// written, it is delayed further, until [`MAX_PERIOD_S`] has passed.
     pub(super) fn is_due(&mut self, now: Timestamp, period_s: f64) -> bool {
         let elapsed_s = now.since(*self.last.get_or_insert(now));
         let may_write = self.ahead_at(now) <= 0.0 || elapsed_s >= MAX_PERIOD_S;

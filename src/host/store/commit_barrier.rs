@@ -2,8 +2,9 @@
 //!
 //! During a commit, every announcing frame ([`Transmit::announces`]) waits. These are the frames that announce the
 //! result, the cyclic frames that would repeat it, and all other frames of the same kinds. If the first packet of a
-//! transfer waits, its later packets wait too. The frames are sent in order. The status frame is not held, because
-//! its state of charge and validity must be up to date. Of the alarms, it states only the number of raised alarms.
+//! J1939 transfer (a message in several packets) waits, its later packets wait too. The frames are sent in order. The
+//! status frame is not held, because its state of charge and validity must be up to date. Of the alarms, it states only
+//! the number of raised alarms.
 //!
 //! No frame waits longer than [`MAX_WAIT`], because an alarm on the bus is more important than an alarm on disk.
 
@@ -88,7 +89,7 @@ mod tests {
         let (control, data, health) = (0x10, 0x11, 0x12);
         assert!(!barrier.hold(&frame(health, 0)), "nothing to wait for");
         barrier.begin(1, now);
-        // The frames are a transfer's announcement, its packets on later ticks, and a cyclic frame between them.
+        // The frames are the first packet of a transfer, its later packets, and a cyclic frame between them.
         for (id, data) in [(control, 1), (data, 2), (health, 3), (data, 4)] {
             assert!(barrier.hold(&frame(id, data)));
         }

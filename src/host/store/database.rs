@@ -6,7 +6,7 @@
 //! | `moment` | the time of a commit: wall clock, inputs' clock, boot, pack | as long as its segment |
 //! | `half_cycle` | a charge or discharge of a cell | as long as its segment |
 //! | `capacity` | a learned capacity | as long as its segment |
-//! | `loss_modes` | the loss modes of a cell | as long as its segment |
+//! | `loss_modes` | how much lithium and active material a cell has lost | as long as its segment |
 //! | `remaining_life` | a forecast of the remaining life | as long as its segment |
 //! | `outlook` | energy and power of the pack | as long as its segment |
 //! | `model` | a change of the cell model | as long as its segment |
@@ -16,7 +16,8 @@
 //! | `meta` | the number of segments, and the vehicle (one row) | always |
 //!
 //! The tables from `half_cycle` to `reset` share one numbering of rows. The oldest segments are deleted first; their
-//! rows in `segment` remain. Cells count from 0, times are nanoseconds. `PRAGMA user_version` is the format.
+//! rows in `segment` remain. Cells count from 0, times are nanoseconds. `PRAGMA user_version` contains the version of
+//! the format.
 //!
 //! The database is one file in write-ahead mode with `synchronous=FULL`. A commit that has returned survives a power
 //! cut, and a commit that has not returned leaves no trace. A damaged file and an inaccessible file give different
@@ -95,8 +96,8 @@ impl From<rusqlite::Error> for OpenError {
 }
 
 /// Whether an error means that the file's contents are wrong. An SQLite error counts as damage unless it has another
-/// known cause, such as the disk, the permissions or another process. If damage were not recognised, the store would
-/// never be written again.
+/// known cause, such as the disk, the permissions or another process. If damage were not recognised, the database would
+/// not be replaced by a new one, and the store would never be written again.
 pub(super) fn is_damage(error: &rusqlite::Error) -> bool {
     match error {
         rusqlite::Error::SqliteFailure(failure, _) => !matches!(
@@ -105,7 +106,7 @@ pub(super) fn is_damage(error: &rusqlite::Error) -> bool {
                 | ErrorCode::DiskFull
                 | ErrorCode::CannotOpen
                 | ErrorCode::PermissionDenied
-                | ErrorCode::ReadOnly // `Database::open` has found that the file itself is writable
+                | ErrorCode::ReadOnly // `Database::open` has reported a file that is marked as read-only
                 | ErrorCode::DatabaseBusy
                 | ErrorCode::DatabaseLocked
                 | ErrorCode::FileLockingProtocolFailed
@@ -181,7 +182,7 @@ impl Database {
         Ok(Self { connection, segment, pack, path: path.to_owned(), opened: files_at(path) })
     }
 
-    /// Whether the names of the database and its log still belong to the open files. If another program deletes or
+    /// Whether the paths of the database and of its log still lead to the open files. If another program deletes or
     /// replaces these files, commits still succeed, but everything they write is lost when the database is closed.
     pub(super) fn has_its_names(&self) -> bool {
         files_at(&self.path) == self.opened
@@ -200,8 +201,8 @@ impl Database {
         (self.segment.last, hex(&self.segment.hash))
     }
 
-    /// Whether another pack was connected after pack `pack`. Two stored values are checked, so that one flipped bit
-    /// does not make a state obsolete.
+    /// Whether another pack was connected after pack `pack`. If so, the caller discards the stored state of `pack`. Two
+    /// stored values are checked, so that one flipped bit cannot discard a valid state.
     pub(super) fn is_closed(&self, pack: i64) -> rusqlite::Result<bool> {
         let sql = "SELECT 1 FROM pack WHERE id = ?1 AND closed_ns IS NOT NULL";
         Ok(pack < self.pack && self.connection.prepare(sql)?.exists([pack])?)
@@ -317,7 +318,7 @@ fn prepare(connection: &Connection) -> rusqlite::Result<()> {
         tracing::warn!(mode, "no write-ahead log on this file system: every commit is written twice");
     }
     connection.pragma_update(None, "synchronous", "FULL")?;
-    // A negative value is in KiB.
+    // A negative cache size is in KiB.
     connection.pragma_update(None, "cache_size", -256)?;
     connection.pragma_update(None, "temp_store", "MEMORY")?;
     connection.pragma_update(None, "cell_size_check", true)?;

@@ -19,7 +19,7 @@ use crate::token_bucket::{BucketSize, TokenBucket};
 /// takes 100 bytes and is kept for years. Otherwise, a hybrid that changes between charge and discharge every minute
 /// would write too many rows. Remaining lives, and energy and power, have the same limit.
 const CAPACITIES: BucketSize = BucketSize { burst: 64.0, period_s: 3600.0 };
-/// Minimum change of a capacity or remaining life that is written when the allowance is used up, in standard
+/// If the allowance is used up, a capacity or remaining life is written only if it has changed by this many standard
 /// deviations.
 const MIN_CHANGE_STD: f64 = 0.25;
 /// How often deferred rows are written with a checkpoint or with other rows: 60 times at once (one hour of
@@ -180,7 +180,8 @@ enum Urgency {
     /// The event is stored with a later commit. Filter resets are deferred, because they may be frequent and are not
     /// announced.
     Deferred,
-    /// The event is stored as a row before it is announced. A start can reapply it from the row.
+    /// The event is stored as a row before it is announced. After a restart, the daemon can apply it again from the
+    /// row.
     AsRow,
     /// The event is stored with the whole state before it is announced. The row alone is not enough to restore the
     /// result.

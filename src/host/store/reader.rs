@@ -73,7 +73,7 @@ pub struct HistoryEntry {
     pub values: Vec<serde_json::Value>,
 }
 
-/// Number of half-cycles that a store contains, has deleted and has written.
+/// Numbers of half-cycles (charges and discharges) that a store contains, has deleted and has written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct HistoryExtent {
     /// Number of the connected pack, from 1; 0 = no pack has been connected.

@@ -1,5 +1,5 @@
-//! The store of a replay. A [`Recorder`] writes the same files as the daemon's store, but synchronously and with bus
-//! times.
+//! The store of a replay. A [`Recorder`] writes the same files as the daemon's store, with two differences: each write
+//! is finished when the call returns, and rows and states have the times of the log.
 
 use std::path::Path;
 

@@ -39,7 +39,8 @@ pub fn replace_pack(path: &Path) -> Result<ReplacedPack, String> {
     })?;
     let now = Stamp::now(Timestamp::from_nanos(Reading::now().realtime_ns), BootId::current());
     let known = StateFiles::open(path).1.newest.map_or(0, |state| state.pack);
-    // Open the folder like the daemon, so that damage is found and recorded before the history is closed.
+    // Opens the folder in the same way as the daemon, so that damage is found and recorded before the history is
+    // closed.
     let mut replace = || {
         let (mut database, rows) = folder.open(&now, known).map_err(|error| named(error.to_string()))?;
         let damage = rows.iter().find_map(HistoryRow::detail).map(str::to_owned);
@@ -54,8 +55,8 @@ pub fn replace_pack(path: &Path) -> Result<ReplacedPack, String> {
     };
     // If the first attempt finds damage, the second attempt sets the database aside.
     let replaced = replace().or_else(|_: String| replace())?;
-    // A state of a closed pack is not restored. If the history were lost, the store would not know that the pack is
-    // closed. Therefore delete the state.
+    // The state of a closed pack must never be restored. The store knows from the history which packs are closed. The
+    // state is deleted in case the history is lost later.
     state_files::forget(path).map_err(|error| named(error.to_string()))?;
     Ok(replaced)
 }

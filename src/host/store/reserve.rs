@@ -61,7 +61,7 @@ impl Reserve {
         }
         let path = self.folder.join(FILE_NAME);
         if fs::symlink_metadata(&path).is_ok_and(|found| !found.is_file()) {
-            // Remove a file of another kind that has this name.
+            // Something that is not a regular file, such as a link, has the reserve's name. Remove it.
             let _ = fs::remove_file(&path);
         }
         let is_missing = !path.exists();
@@ -69,7 +69,8 @@ impl Reserve {
         self.left = if is_missing { 0 } else { self.left };
         let grown = opened.and_then(|file| {
             let grown = write(&file, BYTES - self.left);
-            // A partly extended file would only take room from other files.
+            // If the file cannot be extended completely, it gets its old length again. A partly extended file would
+            // only take room from other files.
             let kept = grown.as_ref().map_or(Some(self.left), |()| None);
             kept.map_or(Ok(()), |left| file.set_len(left as u64)).and(grown)
         });

@@ -1,4 +1,5 @@
-//! Writes the state to the runtime folder every second, so that a crash of the daemon alone loses at most one second.
+//! Writes the state to the runtime folder every second, so that a crash of the daemon (not of the computer) loses at
+//! most one second.
 //!
 //! The folder is in memory and exists until the computer restarts (systemd keeps it over restarts of the service). A
 //! separate thread writes the latest state, so that the state does not wait for a slow disk.

@@ -39,7 +39,7 @@ pub(super) struct Segment {
     pub day: i64,
     pub first: i64,
     pub last: i64,
-    /// Number of the last row's moment (a row of the table `moment`).
+    /// Number of the moment (row of the table `moment`) at which the last row was written.
     pub last_moment: i64,
     pub half_cycles: i64,
     /// Whether the rows were deleted because of the limits on rows and age.
@@ -122,10 +122,11 @@ impl Segment {
             .map(drop)
     }
 
-    /// Computes the hash of row `last` from the stored rows.
+    /// Computes the hash of the chain at row `last` from the stored rows. `before`: hash of the chain before the
+    /// segment.
     fn hash_to(&self, connection: &Connection, before: &Hash, last: i64) -> rusqlite::Result<Hash> {
         let mut rows: BTreeMap<(i64, HistoryTable), (Hash, i64)> = BTreeMap::new();
-        // Limit the number, so that a damaged number does not fill the memory.
+        // Limit `last`, so that a damaged value cannot fill the memory with rows.
         let last = last.min(self.first.saturating_add(MAX_ROWS + backlog::MAX_ROWS as i64));
         for table in HistoryTable::ALL {
             let sql = format!("{} WHERE r.seq BETWEEN ?1 AND ?2", StoredRow::select(table));
@@ -233,9 +234,9 @@ fn pairs(connection: &Connection) -> rusqlite::Result<Vec<(Segment, Segment)>> {
     Ok(pairs)
 }
 
-/// Deletes the rows of the oldest segment that still has rows. Does so if the history has more than `max_rows` rows,
-/// or if any segment except the newest ended before `horizon_ns`. A segment that was written with an unset wall clock
-/// is not compared with `horizon_ns`. It is deleted when a later segment ended before `horizon_ns`.
+/// If the history has more than `max_rows` rows, or if any segment except the newest ended before `horizon_ns`, deletes
+/// the rows of the oldest segment that still has rows. A segment that was written with an unset wall clock is not
+/// compared with `horizon_ns`. It is deleted when a later segment ended before `horizon_ns`.
 pub(super) fn delete_oldest(
     connection: &Connection,
     newest: &Segment,
@@ -341,7 +342,7 @@ fn judge(connection: &Connection, before: &Segment, segment: &Segment) -> rusqli
     Ok(if expected == hash { None } else { broken(hex(&expected), hex(&hash)) })
 }
 
-/// Compares the stored numbers of segments and rows with the chain.
+/// Compares the numbers of segments and rows that the chain should have with the numbers that the store contains.
 fn judge_number(
     connection: &Connection,
     newest: &Segment,

@@ -1,11 +1,13 @@
-//! Stores the time of a state as shown by every clock, and computes the age of the state at a later time.
+//! Stores with a state the time that each clock shows, and computes the age of the state at a later time.
 //!
 //! The wall clock of a vehicle computer may show 1970 until it is set, and it may step. The boot clock never steps,
-//! but starts again with every boot. Therefore both times are stored, together with the identity of the boot.
+//! but starts again with every boot. Therefore the times of both clocks are stored, together with the identity of the
+//! boot.
 //!
-//! Only the wall clock can measure the age of a state from an earlier boot. Without a battery-backed hardware clock,
-//! it continues from the value that systemd saved last. A week without power then looks like seconds. The wall clock
-//! is therefore trusted only if a hardware clock agrees with it ([`WallClock`]) or a time server has set it.
+//! Only the wall clock can measure the age of a state from an earlier boot. If the computer has no battery-backed
+//! hardware clock, the wall clock continues after a boot from the value that systemd saved last. A week without power
+//! then looks like seconds. The wall clock is therefore trusted only if a hardware clock agrees with it ([`WallClock`])
+//! or a time server has set it.
 
 use std::fmt;
 use std::path::Path;
@@ -21,7 +23,7 @@ pub(super) const SANE_WALL_NS: i64 = 1_704_067_200_000_000_000;
 
 const NS_PER_YEAR: f64 = 365.25 * 86_400.0 * 1e9;
 
-/// The kernel's list of hardware clocks. A sandbox that forbids `adjtimex` can read it.
+/// The kernel's list of hardware clocks. The program can read it even in a sandbox that forbids `adjtimex`.
 const HARDWARE_CLOCKS: &str = "/sys/class/rtc";
 /// systemd's time client creates this file when a time server has set the clock since the boot.
 const SYNCHRONISED: &str = "/run/systemd/timesync/synchronized";
@@ -40,7 +42,7 @@ const BOOT_ID_VARIABLE: &str = "PACKWATCH_BOOT_ID";
 impl BootId {
     /// The identity of a boot that the kernel does not report.
     const UNKNOWN: Self = Self([0; 16]);
-    /// Stands for the boot in the stamps of a replay, which contain bus times.
+    /// Used instead of a boot in the stamps of a replay. In these stamps, every clock shows the time on the bus.
     pub const REPLAY: Self = Self(*b"packwatch replay");
 
     /// The boot of the running system.
@@ -102,15 +104,16 @@ pub(super) enum WallClock {
 }
 
 impl WallClock {
-    /// Assesses the wall clock at the start. A later setting by a GPS receiver or time server has no effect, because
-    /// the age of the state is determined only once.
+    /// Assesses the wall clock when the program starts. If a GPS receiver or a time server sets the clock later, this
+    /// has no effect, because the age of the state is determined only once.
     pub(super) fn assess(now: &Stamp) -> Self {
         Self::judge(now, Path::new(HARDWARE_CLOCKS), Path::new(SYNCHRONISED))
     }
 
     fn judge(now: &Stamp, hardware_clocks: &Path, synchronised: &Path) -> Self {
         let wall_s = now.wall_ns / 1_000_000_000;
-        // A hardware clock without a battery counts from its own start, so its value is compared with the wall clock.
+        // A hardware clock without a battery counts from the time at which it got power. A hardware clock therefore
+        // counts only if its time agrees with the wall clock.
         let agrees = |clock: &Path| {
             let text = std::fs::read_to_string(clock.join("since_epoch")).ok();
             let hardware_s = text.and_then(|text| text.trim().parse::<i64>().ok());
@@ -137,7 +140,7 @@ impl Stamp {
         Self { wall_ns: time.nanos(), time, boottime_ns: time.nanos(), boot: BootId::REPLAY }
     }
 
-    /// The wall-clock time this many years ago, ns since 1970; `None` = the wall clock is not confirmed.
+    /// The wall-clock time `years` before this stamp, ns since 1970; `None` = the wall clock is not confirmed.
     pub(super) fn years_ago_ns(&self, years: f64) -> Option<i64> {
         let is_reliable = self.boot == BootId::REPLAY || WallClock::assess(self) == WallClock::Reliable;
         is_reliable.then(|| self.wall_ns.saturating_sub((years * NS_PER_YEAR) as i64))

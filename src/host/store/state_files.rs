@@ -35,8 +35,8 @@ pub(super) const ASIDE: &str = "state-aside.json.zst";
 const PART: &str = "state.json.zst.part";
 /// Log and history text about a state that is set aside.
 pub(super) const SET_ASIDE: &str = "set aside for the first start at which it fits";
-/// Compression level. The level is low because announcements wait for the compression. Level 19 makes files a sixth
-/// smaller and takes fifty times as long.
+/// Compression level. The level is low because learned values and alarms are sent only after the state has been
+/// compressed and stored. Level 19 makes files a sixth smaller and takes fifty times as long.
 const LEVEL: i32 = 1;
 /// Maximum size of the JSON, bytes: ten times the size for the largest pack.
 const MAX_JSON_BYTES: u64 = 64 << 20;
@@ -203,7 +203,7 @@ impl StateFiles {
         self.aside = Some(1 - self.next);
     }
 
-    /// Whether the newest state still has its name.
+    /// Whether the file of the newest state still exists.
     pub(super) fn is_present(&self) -> bool {
         self.folder.join(FILES[1 - self.next]).exists()
     }

@@ -93,7 +93,7 @@ fn replay_stores_its_final_state() {
     assert!((near.mean - exact.mean).abs() < 1e-8 && (near.std() - exact.std()).abs() < 1e-8, "{near:?} {exact:?}");
 }
 
-/// The document of a state taken at `boottime_s` of boot `boot`.
+/// Builds a state document that was taken `boottime_s` seconds after the boot `boot`.
 pub(super) fn document(boot: u8, boottime_s: i64, wall_s: i64) -> StateDocument {
     let boot = BootId([boot; 16]);
     let time = Timestamp::from_secs(1.0);

@@ -3,8 +3,8 @@
 //! The loop queues rows and the latest state, and gets a number for them: the ticket. The thread takes all queued work,
 //! commits the rows, and writes the state if it is due. Then it reports the last ticket, and whether the attempt
 //! succeeded. The thread retries a failing disk after increasing pauses. During a pause, a ticket is reported at once
-//! as failed, unless rows are queued and the reserve has space left. A failing database does not prevent the state from
-//! being written.
+//! as failed, unless rows are queued and the reserve (disk space that is kept for this case) has space left. A failing
+//! database does not prevent the state from being written.
 //!
 //! A start reapplies the alarm changes of rows that are newer than the stored state. Therefore the rows in the database
 //! must directly follow the stored state. To ensure this, the first rows after a start, after a failure and in a new
@@ -164,7 +164,7 @@ pub(super) struct Writer {
     pub(super) folder: Folder,
     pub(super) state_files: StateFiles,
     pub(super) reserve: Reserve,
-    /// Latest day (UTC, since 1970) whose chain end was logged.
+    /// Latest day (UTC, since 1970) on which the end of the hash chain was logged.
     pub(super) head_day: Option<i64>,
     /// The open database; `None` = the database is not open.
     pub(super) database: Option<Database>,
@@ -199,8 +199,8 @@ impl Writer {
     /// Writes until [`WriteQueue::stop`].
     pub(super) fn run(mut self) {
         self.reserve.make();
-        // If the vehicle cannot be written, the database is closed here. The database is opened again later, and a
-        // failure is reported then.
+        // If the vehicle's identity cannot be written to the database, closes the database. It is opened again later,
+        // and a failure is reported then.
         self.database = self.database.take().filter(|database| database.set_vehicle(&self.vehicle).is_ok());
         loop {
             let work = self.write_queue.take(self.retry.at);
@@ -338,8 +338,8 @@ impl Writer {
         Ok(())
     }
 
-    /// Closes the database if another program has deleted or replaced its files. [`open`](Self::open) then uses the
-    /// file of this name, or creates it.
+    /// Closes the database if another program has deleted or replaced its files. Afterwards, [`open`](Self::open) uses
+    /// the file that now has the database's name, or creates a file.
     fn close_if_replaced(&mut self) -> bool {
         let is_replaced = self.database.as_ref().is_some_and(|database| !database.has_its_names());
         if is_replaced {
@@ -350,7 +350,8 @@ impl Writer {
         is_replaced
     }
 
-    /// Logs the chain's end with the first commit of each day. A rewritten chain does not match the logged end.
+    /// Logs the end of the hash chain with the first commit of each day. If the chain is rewritten later, it does not
+    /// match the logged end.
     fn log_head(&mut self, now: &Stamp) {
         let day = now.wall_ns.div_euclid(NS_PER_DAY);
         if let Some(database) = &self.database

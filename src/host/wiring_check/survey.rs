@@ -1,5 +1,5 @@
-//! Builds the [`Plan`] of `packwatch doctor`: what a configuration expects from the buses. The configuration may have
-//! faults.
+//! Builds the [`Plan`] of `packwatch doctor`: what a configuration expects from the buses. A configuration with faults
+//! is read as far as possible.
 //!
 //! In: the configuration file. Out: the plan, all faults as [`config::load`](crate::config::load) reports them, and the
 //! position of each key. A configuration is rejected if it has no interface or if none of its signals is found.

@@ -2,8 +2,8 @@
 //! same input again. No file is written.
 //!
 //! In: the report and a function that judges the input with another configuration. Out: each finding states whether its
-//! change alone removes the finding without another error or warning. Alternatives are tried one by one. A change that
-//! does not help is removed from the report, so that the reader does not apply it.
+//! change alone removes the finding without causing another error or warning. Alternatives are tried one by one. A
+//! change that does not help is removed from the report, so that the reader does not apply it.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -13,7 +13,7 @@ use super::survey::survey_with;
 use crate::bounded_file;
 use crate::wiring::{Change, Severity, Topic, WiringFinding, WiringReport};
 
-/// Maximum number of trials, because every trial reads the logs again.
+/// Maximum number of trials. It is small, because every trial reads the logs again.
 const MAX_TRIALS: usize = 4;
 
 /// Tries the changes of the first findings. `judge` judges the input with another configuration. It returns `None` if

@@ -1,4 +1,4 @@
-//! Writes pictures as files: self-contained SVG, light or dark as the viewer prefers.
+//! Writes pictures as self-contained SVG files. Their colours follow the viewer's light or dark theme.
 
 use std::path::Path;
 

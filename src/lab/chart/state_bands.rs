@@ -35,12 +35,12 @@ pub struct StateBands {
     pub description: String,
     pub x: Axis,
     pub bands: Vec<StateBand>,
-    /// Meanings of the inks.
+    /// Legend: each colour and its meaning.
     pub keys: Vec<(Ink, String)>,
 }
 
 impl StateBands {
-    /// Returns the elements and their height (pixels).
+    /// Returns the SVG elements and their total height (pixels).
     pub(super) fn draw(&self, size: Size) -> (String, f64) {
         let mut svg = Svg::default();
         let mut top = title(&mut svg, &self.title, size.width);

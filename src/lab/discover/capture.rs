@@ -52,7 +52,7 @@ pub(super) struct Answers {
     /// CAN identifier of the requests, and their first data byte if addressing is extended; `None` = no request was
     /// received.
     pub(super) request: Option<(CanId, Option<u8>)>,
-    /// Data of the answers after the echoed service and identifier.
+    /// Data of the answers, without the service and the identifier that each answer repeats from its request.
     pub(super) payloads: Payloads,
     pub(super) seen: u64,
     stride: u64,

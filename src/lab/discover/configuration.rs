@@ -1,8 +1,9 @@
-//! Writes the best candidates as a configuration, or returns the questions that prevent it.
+//! Writes a configuration with the best candidate signals for each quantity of the pack. If the user must first answer
+//! questions, returns these questions instead.
 //!
 //! The configuration contains everything that the log determines, and lists the remaining decisions: the cell model,
 //! the assignment of sensors to cells, limits and alarms. The sign of the current and the number of cells are never
-//! guessed. Without evidence, they become questions.
+//! guessed. If the log does not show them, they become questions.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
@@ -18,7 +19,7 @@ use crate::fit::quoted;
 use crate::import::{DiagnosticSignal, DiagnosticTable, series};
 use crate::wiring::evidence::{HIDDEN_SOC, PackQuantity};
 
-/// Statement for a missing signal, with the next step.
+/// Text for a quantity without a candidate signal. Names the next step.
 const NO_CANDIDATE: &str =
     "no signal in the log looks like it: give the DBC file that describes it with --dbc, or a log of a drive";
 
@@ -29,7 +30,7 @@ pub struct PackSettings {
     pub source: String,
     /// Paths of the DBC files as the configuration names them, in the order in which the files were added.
     pub databases: Vec<String>,
-    /// Path of the new DBC as the configuration names it. It describes the fields that no given DBC describes.
+    /// Path, as the configuration names it, of the DBC that is written for the fields that no given DBC describes.
     pub own_database: String,
     /// Path of the cell model as the configuration names it; `None` if the label describes the cell.
     pub cell_model: Option<String>,
@@ -42,10 +43,10 @@ pub struct PackSettings {
 pub struct PackConfiguration {
     /// TOML.
     pub text: String,
-    /// DBC of the fields that no given DBC describes. It must be saved under the path in
+    /// Text of a DBC with the fields that no given DBC describes. It must be saved under the path in
     /// [`PackSettings::own_database`].
     pub database: Option<String>,
-    /// Questions that the user must decide because the log does not answer them.
+    /// Questions that the user must answer because the log does not answer them.
     pub open: Vec<String>,
 }
 
@@ -155,7 +156,7 @@ impl Writer<'_> {
         else {
             return Err(questions);
         };
-        // An unnamed field may be another quantity than a temperature.
+        // A raw field without a name may be another quantity than a temperature, so it is not used.
         let temperature = self.best(PackQuantity::Temperature).filter(|candidate| !self.is_raw(candidate));
         let soc = self.best(PackQuantity::Soc).map(|candidate| ("reported_soc", candidate));
         let soh = self.best(PackQuantity::Soh).map(|candidate| ("reported_soh", candidate));
@@ -192,7 +193,8 @@ impl Writer<'_> {
         candidate.members.iter().any(is_raw)
     }
 
-    /// Returns the number of cells of a group; `None` if the numbers have gaps or there are fewer than two cells.
+    /// Returns the number of cells in a group of numbered cell signals. `None` if the numbers have gaps, or if there
+    /// are fewer than two cells.
     fn row(&self, group: &Candidate) -> Option<u16> {
         let numbers = self.numbers(group)?;
         let first = *numbers.first()?;
@@ -322,8 +324,8 @@ impl Writer<'_> {
         }
     }
 
-    /// Returns the given definitions, reduced to the selected signals, and for each kind of answer the selected fields
-    /// that no definition describes.
+    /// Returns two lists. The first contains the given definitions of diagnostic answers, reduced to the selected
+    /// signals. The second contains, for each kind of answer, the selected fields that no definition describes.
     fn used_tables(
         &self,
         selection: &Selection<'_>,
@@ -395,8 +397,8 @@ impl Writer<'_> {
         }
     }
 
-    /// Writes the maximum ages of readings. They follow from the periods in the log, because diagnostic answers may be
-    /// many seconds apart.
+    /// Writes the maximum ages of readings. They follow from the signals' periods in the log, because diagnostic
+    /// answers may be many seconds apart.
     fn limits(&self, selection: &Selection<'_>, text: &mut String) {
         let named = [
             ("current", Some(selection.current)),

@@ -3,8 +3,9 @@
 //! * Voltage: fields of 16 bits at every byte and of 12 bits at every half byte, in both byte orders, with common
 //!   scales. The value is plausible for a pack, varies by at most 35 % and takes at least five different codes.
 //! * Current: the same positions, but signed. The changes of the field correlate with the changes of a voltage, because
-//!   the pack has a resistance. The scale is a guess: the common scale whose resistance is closest to the typical
-//!   resistance of the label's pack.
+//!   the pack has a resistance. The scale is a guess. Each common scale gives a resistance of the pack; the scale is
+//!   chosen whose resistance is closest to the typical resistance of a pack with this label (chemistry, capacity,
+//!   number of cells).
 //! * Cells: neighbouring fields of 8, 12 or 16 bits with similar values.
 //!
 //! Temperatures and SOC are not searched for, because they show no characteristic behaviour within minutes.
@@ -20,7 +21,7 @@ use crate::can::signal::{ByteOrder, SignalLayout, ValueType};
 use crate::can::unit::Quantity;
 use crate::wiring::evidence::{Series, Slope, windows};
 
-/// Maximum number of payloads that are evaluated per message, or per page of a message.
+/// Maximum number of payloads that are evaluated per message, or per page of a multiplexed message.
 const MAX_PAYLOADS: usize = 1500;
 const PACK_V: (f64, f64) = (100.0, 950.0);
 /// Scales of a pack voltage (V per code).
@@ -36,7 +37,8 @@ const MAX_SPREAD_V: f64 = 0.25;
 /// Lengths of a cell voltage in bits, each with the scales to try (V per code).
 const CELL_FORMS: [(u16, &[f64]); 3] = [(16, &[0.001, 0.0001, 0.002, 0.0005]), (12, &[0.001, 0.002]), (8, &[0.02])];
 
-/// Returns the name of a message that no DBC describes. The identifier is decimal, so that its digits form one number.
+/// Returns the name of a message that no DBC describes. The identifier is decimal, so that the name contains only one
+/// number.
 pub(super) fn message_name(id: CanId) -> String {
     format!("Message{}", id.raw())
 }
@@ -88,8 +90,8 @@ impl<'a> Samples<'a> {
             // The first payloads are taken, because taking every n-th payload might drop whole pages.
             payloads.iter().take(MAX_PAYLOADS * pages.len()).collect()
         } else {
-            // Short runs of successive payloads are taken, because over longer times, the charge changes the voltage
-            // too.
+            // Short runs of successive payloads are taken. Over longer times, not only the current but also the
+            // changing SOC would change the voltage.
             windows(payloads.iter().collect(), MAX_PAYLOADS, 8.0)
         };
         Self { key, bytes, pages, payloads }
@@ -210,7 +212,7 @@ fn currents<'a>(
         let all = layouts(samples.bytes, true).into_iter().chain(layouts(samples.bytes, false));
         let read = all.map(|layout| (layout, samples.values(&layout, None)));
         let read: Vec<_> = read.filter(|(_, codes)| !codes.is_constant() && !codes.is_counter()).collect();
-        // For example, fields with the lowest and the highest cell voltage repeat a voltage.
+        // Exclude fields that repeat a voltage, such as the lowest and the highest cell voltage.
         let repeats = |codes: &Series| voltages.iter().any(|voltage| is_reading_of(codes, &voltage.series));
         let taken: Vec<SignalLayout> =
             read.iter().filter(|(_, codes)| repeats(codes)).map(|(layout, _)| *layout).collect();
@@ -257,7 +259,8 @@ fn is_reading_of(codes: &Series, voltage: &Series) -> bool {
     common && slope.is_some_and(|slope| (0.5..2.0).contains(&(-slope.ohm / scale)))
 }
 
-/// Whether a field overlaps a layout in the message `id` on any interface, because gateways repeat messages.
+/// Whether a field overlaps a layout in the message `id`. The interface is not compared, because gateways repeat
+/// messages on other interfaces.
 fn shares_bits(field: &LogSignal, id: CanId, layout: &SignalLayout) -> bool {
     matches!(&field.origin, SignalOrigin::Field(own) if own.id == id && own.signal.layout.overlaps(layout))
 }

@@ -12,9 +12,10 @@ pub(crate) struct SignalGroup {
 
 type NumberedName<'a> = (usize, Vec<&'a str>);
 
-/// Returns the groups. Each item of `names` is a partition and a name. At least two names of a partition form a group
-/// if their texts between the numbers are equal. The number that varies most is the member's number; if several vary
-/// equally, the last of them is the member's number. If two members have the same number, they are not grouped.
+/// Returns the groups. Each item of `names` is a partition and a name; names of different partitions are never grouped.
+/// Two or more names of a partition form a group if their texts between the numbers are equal. The number that varies
+/// most is the member's number; if several vary equally, the last of them is the member's number. If two members have
+/// the same number, they are not grouped.
 pub(crate) fn groups(names: &[(String, &str)]) -> Vec<SignalGroup> {
     let mut found: BTreeMap<(&str, Vec<&str>), Vec<NumberedName<'_>>> = BTreeMap::new();
     for (index, (partition, name)) in names.iter().enumerate() {

@@ -35,7 +35,7 @@ pub(super) struct LogSignal {
     pub(super) name: String,
     pub(super) bus: BusIndex,
     pub(super) origin: SignalOrigin,
-    /// Meaning of the signal's names and unit.
+    /// What the names and the unit of the signal say about its meaning.
     pub(super) label: SignalLabel,
     /// Values in V, A, degrees Celsius or percent; other units are not converted.
     pub(super) series: Series,

@@ -1,9 +1,9 @@
 //! Searches diagnostic answers for cell voltages, pack voltage, current and temperatures, in the bytes that no
 //! definition describes.
 //!
-//! A row of cell voltages is a run of at least [`MIN_CELLS`] neighbouring values of 8 or 16 bits. With one byte order
-//! and one common scale, all its values are plausible and similar voltages. Other fields are tried at every byte with
-//! common scales; [`judge`](super::judge) decides which quantity they carry.
+//! A row of cell voltages is a run of at least [`MIN_CELLS`] neighbouring values of 8 or 16 bits. If they are read with
+//! the same byte order and scale, all of them are plausible and similar voltages. Other fields are tried at every byte
+//! with usual scales; [`judge`](super::judge) decides which quantity they carry.
 
 use std::collections::BTreeMap;
 
@@ -33,7 +33,7 @@ const CURRENT_FORMS: [(u32, &[f64]); 3] =
 const MIN_ANSWERS: usize = 3;
 
 /// Number of cells found so far for each form of a row. A row of the same form in the next answer continues the
-/// numbers.
+/// numbering of the cells.
 #[derive(Debug, Default)]
 pub(super) struct CellRows(BTreeMap<RowForm, u32>);
 
@@ -41,7 +41,8 @@ pub(super) struct CellRows(BTreeMap<RowForm, u32>);
 /// an `f64`).
 type RowForm = (BusIndex, CanId, Option<u8>, u32, u32, bool, u64);
 
-/// Returns the possible signals in these answers, without the bits in `described` (first, last).
+/// Returns the possible signals in these answers. Skips the bits that a definition already describes: `described` lists
+/// their ranges (first bit, last bit).
 pub(super) fn signals(
     key: &AnswerKey,
     answers: &Answers,
@@ -114,7 +115,8 @@ fn signal(key: &AnswerKey, answers: &Answers, form: DiagnosticSignal) -> Option<
         "A" => Quantity::Current,
         _ => Quantity::Voltage,
     };
-    // Cells are numbered across all answers. Other names contain the service and the identifier of their answer.
+    // Cells are numbered across all answers, so their names are unique. The other names need the service and identifier
+    // of their answer.
     let mut form = form;
     if !form.name.starts_with(CELL) {
         form.name = format!("D{:02X}{:02X}_{}", key.service, key.identifier, form.name);
@@ -178,7 +180,8 @@ fn temperature_row(
         if is_absent(byte) && !row.is_empty() {
             continue;
         }
-        // The row ends if a byte between two of its positions belongs to a missing sensor.
+        // At a distance above 1, the bytes between two sensors are skipped. If one of them belongs to a missing sensor,
+        // the row ends.
         if !row.is_empty() && (byte + 1 - distance..byte).any(is_absent) {
             break;
         }

@@ -1,5 +1,6 @@
-//! Collects the signals of a log with their values. DBC files and definitions of diagnostic answers describe signals.
-//! Further signals are searched for in undescribed bytes of answers and, without DBC files, in messages.
+//! Collects the signals of a log with their values. Some signals are described by DBC files or by definitions of
+//! diagnostic answers. Further signals are searched for in the undescribed bytes of diagnostic answers and, if there
+//! are no DBC files, in all messages.
 
 use super::PositiveDirection;
 use super::capture::{AnswerKey, Answers, Capture, MessageKey, Payloads};
@@ -106,8 +107,8 @@ fn of_message(key: MessageKey, payloads: &Payloads, file: usize, message: &Messa
     message.signals.iter().filter(|signal| signal.layout.length_bits > 2).filter_map(of_signal).collect()
 }
 
-/// Returns the offset (A) that is missing in the description of a current. A pack's current comes near zero, so an
-/// offset is missing if the values never do.
+/// Returns the offset (A) that is missing in the description of a current. A pack's current comes near zero at some
+/// time, so an offset is missing if the values never come near zero.
 fn missing_offset(series: &Series, signal: &Signal) -> Option<f64> {
     let factor = signal.layout.factor;
     if series.extent.min.abs().min(series.extent.max.abs()) < STEADY_A || factor <= 0.0 || signal.layout.offset != 0.0 {
@@ -162,8 +163,9 @@ fn of_definition(
     each.collect()
 }
 
-/// Returns the values of a defined signal, and whether it is read as signed. An unsigned current is read as signed if
-/// this reduces its range to less than a quarter. Read as unsigned, a few negative amperes look like thousands.
+/// Returns the values of a defined signal, and whether it is read as signed. If a signed current is read as unsigned, a
+/// few negative amperes look like thousands. An unsigned current is therefore read as signed if this reduces its range
+/// to less than a quarter.
 fn values(answers: &Answers, signal: &DiagnosticSignal, conversion: (f64, f64), is_current: bool) -> (Series, bool) {
     let collect = |signal: &DiagnosticSignal| {
         let value = |data: &[u8]| {

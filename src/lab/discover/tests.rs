@@ -242,7 +242,8 @@ proptest::proptest! {
         let mut discoverer = pack(1.0);
         let ids = [0x100, 0x7BB, 0x79B, 0x6F1];
         for (at, id, mut data) in frames {
-            // Random first bytes rarely belong to multi-frame messages.
+            // In ISO-TP, the upper four bits of the first byte are the frame type, from 0 to 3. The mask makes it more
+            // likely that random frames form multi-frame messages.
             if let Some(first) = data.first_mut() {
                 *first &= 0x3F;
             }

@@ -105,7 +105,8 @@ pub(super) fn fit(
     (0..cells).into_par_iter().map(|cell| fit_cell(cell, distances.len(), &factors, &all_v)).collect()
 }
 
-/// Returns the coefficients for each difference, computed from the latest row that is not after the difference.
+/// Returns the coefficients of the equation of each difference. They come from the latest row that is not after the
+/// difference.
 fn factors(
     stretch: usize,
     distances: &CellDistances,

@@ -58,8 +58,8 @@ fn rows<'a>(label: &Label, offset_a: f64, stretches: impl Iterator<Item = (&'a M
 
 /// Compares the chemistries, using the capacity (Ah) and the current offset (A) of a fit. Returns a sentence if another
 /// chemistry is clearly better, or if there are too few rows. `error_ratio` is the circuit model's error at the coldest
-/// temperature divided by its error when warm. It scales the margin with its square, because log likelihoods depend on
-/// squared errors.
+/// temperature divided by its error when warm. The margin is multiplied by the square of this ratio, because log
+/// likelihoods depend on squared errors.
 pub(super) fn note<'a>(
     label: &Label,
     (capacity_ah, offset_a): (f64, f64),

@@ -105,10 +105,10 @@ fn held_rows(part: &MeasuredPart, held_s: f64) -> Vec<usize> {
     (0..part.len()).filter(|k| held(k)).collect()
 }
 
-/// Returns the voltage limits of whole cycles. The last row of a complete discharge is the first row below the cut-off
-/// voltage. Of the voltages in these last rows, the highest is nearest to the cut-off. It is rounded up to a multiple
-/// of 0.1 V, as cut-offs are. Aborted discharges do not count. Charges are held at the upper limit, which is the median
-/// of their highest voltages, rounded to 0.05 V.
+/// Returns the voltage limits of whole cycles. A complete discharge ends with the first row below the cut-off voltage.
+/// Of these last rows, the one with the highest voltage is nearest to the cut-off. Its voltage is rounded up to a
+/// multiple of 0.1 V, because cut-off voltages are usually such multiples. Aborted discharges do not count. The upper
+/// limit is the voltage at which charges are held: the median of their highest voltages, rounded to 0.05 V.
 fn cycle_limits(files: &[MeasuredFile], first: usize) -> Option<(Limit<'_>, Limit<'_>)> {
     let (mut ends, mut tops) = (Vec::new(), Vec::new());
     for file in files {

@@ -42,14 +42,14 @@ const LEAST_ROWS: usize = 20;
 const BEGINNING_STD: f64 = 0.02;
 /// A stretch starts full if its open-circuit voltage is at least the OCV at this SOC.
 const FULL_SOC: f64 = 0.975;
-/// Smallest series resistance of a real cell, as a share of the model's resistance. It gives the open-circuit voltage
-/// at the start of a stretch.
+/// Smallest series resistance of a real cell, as a share of the model's resistance. The open-circuit voltage at the
+/// start of a stretch is computed with this resistance.
 const LEAST_RESISTANCE: f64 = 0.4;
 /// Standard deviation of the initial SOC of a stretch that starts full.
 const FULL_STD: f64 = 0.01;
-/// Diffusion limits a cold cell below an SOC of this value times (Arrhenius factor - 1). A circuit model does not
-/// describe the voltage there, and this voltage error would be mistaken for lost capacity. The value was chosen on
-/// Panasonic 18650PF cells.
+/// If the SOC of a cold cell is below this value times (Arrhenius factor - 1), diffusion limits the cell. A circuit
+/// model does not describe the voltage in this range, and the voltage error would be mistaken for lost capacity. The
+/// value was chosen on Panasonic 18650PF cells.
 const KNEE_SOC: f64 = 0.13;
 /// Upper limit of [`KNEE_SOC`] times (Arrhenius factor - 1).
 const MOST_KNEE_SOC: f64 = 0.35;
@@ -57,12 +57,13 @@ const MOST_KNEE_SOC: f64 = 0.35;
 /// not settle within a drive. After rests of 20 min at 10 to -20 degrees C, the value is 0.013 to 0.024 for Panasonic
 /// 18650PF cells. Rests during drives are shorter, so the error is larger.
 const COLD_SOC: f64 = 0.03;
-/// Residual (V) above which the logs cannot come from a single kind of cell. In the cold, it is multiplied by a power
-/// of the Arrhenius factor. Fits of the cells of `tests/label` leave 5 to 20 mV when warm and 27 mV at 0 degrees C.
+/// Residual (V) above which the logs cannot come from a single kind of cell. In the cold, this limit is multiplied by a
+/// power of the Arrhenius factor. Fits of the cells of `tests/label` leave 5 to 20 mV when warm and 27 mV at
+/// 0 degrees C.
 const UNFIT_V: f64 = 0.04;
 /// A charge is complete only if the voltage is within this distance of the maximum voltage (V).
 const HELD_V: f64 = 0.012;
-/// A charge is complete only if charging the rated capacity with the remaining current would take longer than this (h).
+/// A charge is complete only if the charge current has fallen below the rated capacity divided by this time (h).
 const FADED_H: f64 = 15.0;
 /// Smallest assumed error of the configured model's open-circuit curve (V): first the part that varies smoothly over
 /// [`CURVE_SOC`], then the independent error of each breakpoint.
@@ -149,7 +150,8 @@ impl MeanCell {
             return;
         }
         let last_s = self.stretches.last().and_then(|stretch| stretch.part.time_s.last().copied());
-        // Longest gap within a stretch (s): longer than the interval of any logger, shorter than a stop.
+        // A gap of more than 120 s begins a new stretch. This is longer than the interval of any logger and shorter
+        // than a stop.
         let has_hole = last_s.is_none_or(|last_s| time_s - last_s > 120.0 || time_s < last_s);
         if std::mem::take(&mut self.begins) || has_hole {
             let beginning = (soc, soc_std.hypot(BEGINNING_STD));
@@ -200,7 +202,8 @@ fn fit_stretches(
     let known = known(model, &grid, request.monitor);
     let fit = unanchored::fit(&settings, &known, &records, |pass, cost| progress(FitProgress::Pass(pass, cost)))
         .map_err(LabError::Data)?;
-    // With a large residual, the logs come from two packs or from cells of an unknown kind. The prior is then used.
+    // If the residual is large, the logs come from two packs or from cells of an unknown kind. The model from which the
+    // fit started is then kept.
     let unfit_v = Some(fit.fitted.total.rmse_v).filter(|rmse_v| *rmse_v > unfit_v(&grid));
     let fit =
         if unfit_v.is_some() { unanchored::prior(&settings, &known, &records).map_err(LabError::Data)? } else { fit };
@@ -303,7 +306,8 @@ fn stretches(request: &LogRequest<'_>, log: usize, path: &Path) -> Result<Vec<St
     let sinks = Sinks { watch: Some(watch), ..Sinks::default() };
     let mut source = LogSource::new([path.to_owned()], (request.options)());
     let settings = ReplaySettings::plain(request.sleep_gap_s, request.interfaces.clone());
-    // Without a label, the monitor learns no model, so the initial model stays the same during the replay.
+    // The label (chemistry and rated capacity of the cells) is removed from the configuration. Without a label, the
+    // monitor does not learn a model, so the initial model stays the same during the replay.
     let monitor = Monitor::new(MonitorConfig { label: None, ..request.monitor.clone() });
     replay::run(&mut source, monitor, sinks, settings, &mut |_| ())
         .map_err(|error| LabError::Data(error.to_string()))?;
@@ -313,7 +317,8 @@ fn stretches(request: &LogRequest<'_>, log: usize, path: &Path) -> Result<Vec<St
     Ok(stretches.into_iter().map(|stretch| Stretch { log, ..stretch }).collect())
 }
 
-/// Converts a stretch to rows of the fit. `soc` is minus the charge taken out since the first row (Ah).
+/// Converts a stretch to rows of the fit. In these rows, the field `soc` contains minus the charge that was taken out
+/// since the first row (Ah).
 fn unanchored(stretch: &Stretch, grid: &Grid, model: &CellModel) -> UnanchoredRecord {
     let mut part = stretch.part.clone();
     let first_s = part.time_s[0];
@@ -333,15 +338,15 @@ fn unanchored(stretch: &Stretch, grid: &Grid, model: &CellModel) -> UnanchoredRe
     UnanchoredRecord { record, scale, beginning, full }
 }
 
-/// Whether a stretch starts with a full cell: the open-circuit voltage reaches that of a full cell even with the
-/// smallest resistance.
+/// Whether a stretch starts with a full cell: even with the smallest resistance ([`LEAST_RESISTANCE`]), the computed
+/// open-circuit voltage reaches the open-circuit voltage of a full cell.
 fn begins_full(part: &MeasuredPart, model: &CellModel) -> bool {
     let (voltage_v, current_a, temperature_c) = (part.voltage_v[0], part.current_a[0], part.temperature_c[0]);
     let drop_v = LEAST_RESISTANCE * model.r0_ohm(&model.grid_position(1.0, temperature_c)) * current_a;
     voltage_v + drop_v >= model.ocv_v(&model.grid_position(FULL_SOC, temperature_c))
 }
 
-/// Returns the voltage (V) below which diffusion limits a cold cell. Rows below it do not count in the fit.
+/// Returns the voltage (V) below which diffusion limits a cold cell. Rows with a lower voltage do not count in the fit.
 fn knee_v(model: &CellModel, current_a: f64, temperature_c: f64) -> f64 {
     let soc = (KNEE_SOC * colder(temperature_c)).min(MOST_KNEE_SOC);
     if soc <= 0.0 {
@@ -351,7 +356,8 @@ fn knee_v(model: &CellModel, current_a: f64, temperature_c: f64) -> f64 {
     model.ocv_v(&position) - model.settled_ohm(&position) * current_a.max(0.0)
 }
 
-/// Returns the charge taken out (Ah) and the time (h) of the last row at which a charge is complete.
+/// Finds the last row at which a charge is complete. Returns the charge taken out before this row (Ah) and the time of
+/// the row (h).
 fn full(part: &MeasuredPart, model: &CellModel) -> Option<(f64, f64)> {
     let most_a = model.rated_capacity_ah / FADED_H;
     let is_full = |&k: &usize| {
@@ -364,7 +370,7 @@ fn temperature_nodes(stretches: &[Stretch]) -> Vec<f64> {
     let of_stretch = |stretch: &Stretch| median(stretch.part.temperature_c.iter().copied());
     let mut medians: Vec<f64> = stretches.iter().filter_map(of_stretch).collect();
     medians.sort_by(f64::total_cmp);
-    // Stretches within 5 K share a node.
+    // Neighbouring temperatures that differ by less than 5 K are combined to one temperature breakpoint.
     let groups = medians.chunk_by(|a, b| b - a < 5.0);
     groups.map(|group| (10.0 * group.iter().sum::<f64>() / group.len() as f64).round() / 10.0).collect()
 }

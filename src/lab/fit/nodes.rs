@@ -8,8 +8,8 @@ use crate::ident::grid::interpolate;
 
 /// Maximum SOC error of the linear interpolation, fraction.
 const MOST_POINTS: f64 = 0.005;
-/// Width over which the slope is computed, SOC. It is wider than the steps in a plateau, because a changing SOC
-/// estimate crosses these steps.
+/// Width over which the slope of a curve is computed, SOC. A plateau has short steps. The width is larger than such a
+/// step, so that a step does not count as a steep slope: an SOC estimate that changes crosses it soon.
 const SLOPE_WIDTH: f64 = 0.04;
 /// Smallest distance between breakpoints, and between the SOC values at which the error is computed.
 const LEAST_DISTANCE: f64 = 0.01;

@@ -1,9 +1,10 @@
 //! Determines the measured range of a model, and extends the model's tables beyond the measured temperatures.
 //!
-//! Ranges are given for temperature (degrees Celsius), current (A) and SOC. A row is added [`REACH_K`] beyond each end
-//! of the measured temperatures. If the nodes do not reach an end, a row is also added at this end. Added rows repeat
-//! the open-circuit curve and the time constants of the nearest fitted row. Their resistances follow Arrhenius' law.
-//! The law is only approximate, so the voltage error grows with the distance.
+//! Ranges are given for temperature (degrees Celsius), current (A) and SOC. A table has one row per temperature. A row
+//! is added [`REACH_K`] beyond each end of the measured temperatures. If the fitted rows do not reach an end of the
+//! measured temperatures, a row is also added at this end. Added rows repeat the open-circuit curve and the time
+//! constants of the nearest fitted row. Their resistances follow Arrhenius' law. The law is only approximate, so the
+//! voltage error grows with the distance.
 
 use crate::cell::arrhenius;
 use crate::filter::ends;
@@ -135,7 +136,7 @@ impl ModelTables {
         self.voltage_error_v.extend(nodes.map(|node| {
             let settled_ohm = r_ohm.iter().fold(r0_ohm[node], |sum, r| sum + r[node]);
             let arrhenius_v = log_std * rms_a * settled_ohm * colder;
-            // The error is at most 0.5 V, because with this error, a voltage hardly affects an estimate.
+            // The error is limited to 0.5 V. With this error, a voltage already hardly affects an estimate.
             libm::hypot(voltage_error_v[node] * libm::pow(colder, COLD_POWER), arrhenius_v).min(0.5)
         }));
     }

@@ -26,10 +26,11 @@ pub struct FitRequest {
     pub voltage_min_v: Option<f64>,
     /// Highest voltage under charge (V); `None` = from the data.
     pub voltage_max_v: Option<f64>,
-    /// Shift of the open-circuit curve with lost capacity. `None` = from the electrodes found in a slow test. If no
-    /// electrodes were found, the shift is 0, or [`super::AGEING_SHIFT`] for an ageing cell.
+    /// Shift of the open-circuit curve as the cell loses capacity: with 0, the curve shrinks evenly; 1 is a pure loss
+    /// of lithium. `None` = from the electrodes found in a slow test. If no electrodes were found, the shift is 0, or
+    /// [`super::AGEING_SHIFT`] for an ageing cell.
     pub ageing_shift: Option<f64>,
-    /// Slow tests.
+    /// Slow tests: files with discharges so slow that they show the open-circuit voltage.
     pub ocv: Vec<PathBuf>,
     /// Number of RC branches, 1 to 3; `None` = 2, or 1 for an ageing cell.
     pub branches: Option<usize>,

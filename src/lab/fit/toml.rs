@@ -103,7 +103,8 @@ fn measured(out: &mut String, outcome: &FitOutcome) {
     line(out, &format!("soc = [{:.3}, {:.3}]", range.soc.0, range.soc.1));
 }
 
-/// Returns the file name with its folder, which identifies the file and reveals nothing else about the machine.
+/// Returns the file name with the name of its folder. This identifies the file, but does not reveal the rest of the
+/// path.
 fn file_name(path: &std::path::Path) -> String {
     let parts: Vec<_> = path.components().map(|part| part.as_os_str().to_string_lossy().into_owned()).collect();
     parts[parts.len().saturating_sub(2)..].join("/")

@@ -1,8 +1,9 @@
 //! Describes the accuracy of a fitted model in plain words.
 //!
-//! The SOC error is the voltage error (V, for data outside the fit) divided by the slope of the open-circuit curve, as
-//! a root mean square over [`MIDDLE`]. This error applies if voltage alone determines the SOC. Counting charge between
-//! readings reduces it; sensor errors increase it.
+//! The SOC error at a breakpoint is the voltage error there (V, on data that the fit did not use) divided by the slope
+//! of the open-circuit curve. The reported SOC error is the root mean square over the SOC range [`MIDDLE`]. It applies
+//! if the SOC is determined from voltage alone. Counting charge between readings reduces the error; sensor errors
+//! increase it.
 
 use super::{FitOutcome, MeasuredRange};
 use crate::ident::fit::{FittedTables, MIN_SLOPE_V, SUPPORTED_S};
@@ -51,7 +52,7 @@ fn rounded(points: f64) -> String {
 }
 
 fn accuracy(rows: &[(f64, f64)]) -> Vec<String> {
-    // A temperature counts as good if its SOC error is at most 2 points.
+    // A temperature counts as good if the SOC error at this temperature is at most 2 percentage points.
     let (good, poor): (Vec<_>, Vec<_>) = rows.iter().partition(|(_, points)| *points <= 2.0);
     let mut said = Vec::new();
     if let (Some((low_c, _)), Some((high_c, _))) = (good.first(), good.last()) {
@@ -66,8 +67,8 @@ fn accuracy(rows: &[(f64, f64)]) -> Vec<String> {
     said
 }
 
-/// Lists the SOC breakpoints where the curve is too flat to find the SOC from voltage: the error exceeds 5 points at
-/// every temperature.
+/// Lists the SOC breakpoints at which the curve is too flat to find the SOC from voltage, because the SOC error exceeds
+/// 5 percentage points at every temperature.
 fn flat(soc: &[f64], points: &[f64], columns: usize) -> Option<String> {
     let is_flat = |s: &usize| points.iter().skip(*s).step_by(columns).all(|points| *points > 5.0);
     let flat: Vec<String> = (0..columns).filter(is_flat).map(|s| soc[s].to_string()).collect();

@@ -1,14 +1,15 @@
 //! Scores the alarms of one threshold in one log: lead time before the end of life, missed alarms and false alarms.
 //!
-//! The terms come from `tests/alarm_tradeoff.md`. Here, they also cover logs that end before the end of life:
+//! The terms come from `tests/alarm_tradeoff.md`. Here, they also cover logs that end before the end of life. If a
+//! horizon (days or cycles) is given, an alarm is right only if the end of life follows within the horizon.
 //!
 //! * **end of life**: if the true capacities are known, the first time at which the capacity of a cell is below the
 //!   limit. Otherwise, the time from which the weakest learned capacity stays below the limit until the end of the log.
-//! * **true raise**: a raise before the end of life and, with a horizon, within the horizon before it.
+//! * **true raise**: a raise before the end of life. With a horizon, the end of life must follow within the horizon.
 //! * **false alarm**: with a horizon, a raise after which the end of life does not follow within the horizon. Without a
 //!   horizon, any raise in a log without an end of life. Raises at or after the end of life are neither true nor false.
-//! * **open**: with a horizon, a raise in a log without an end of life, within the horizon before the end of the log.
-//!   Open raises cannot be judged.
+//! * **open**: with a horizon, a raise in a log without an end of life, if the log ends within the horizon after the
+//!   raise. Open raises cannot be judged, so they are not false.
 //! * **lead**: time from the first true raise to the end of life, in days and in equivalent full cycles.
 //! * **missed**: the end of life was reached without a true raise.
 //! * **false raise**: a raise of `capacity_low` while the true capacity of the cell is above the threshold. It is

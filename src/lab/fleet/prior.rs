@@ -1,4 +1,5 @@
-//! Combines the models that the vehicles of a fleet have learned into a prior for the next vehicle with the same label.
+//! Combines the models that the vehicles of a fleet have learned into a prior: the model with which the next vehicle
+//! starts, if its cells have the same label (chemistry, rated capacity and voltage limits).
 //!
 //! Input: a folder of merged tables with `models.jsonl`, which has a line per learned model. Output: a [`FleetPrior`].
 //! The same models give the same prior.
@@ -11,7 +12,8 @@ use crate::error::LabError;
 
 /// File with the learned models, in the folder of the merged tables.
 pub const MODELS: &str = "models.jsonl";
-/// Fewest vehicles of a prior. Two vehicles say almost nothing about the spread of all vehicles.
+/// Minimum number of vehicles from which a prior is made. Two vehicles say almost nothing about the spread of all
+/// vehicles.
 const LEAST_VEHICLES: usize = 3;
 
 pub(super) fn write_models(folder: &Path, models: &[LearnedModel]) -> Result<(), LabError> {
@@ -22,7 +24,7 @@ pub(super) fn write_models(folder: &Path, models: &[LearnedModel]) -> Result<(),
     Ok(crate::write_file(&folder.join(MODELS), text.as_bytes())?)
 }
 
-/// Combines the models with a wanted label in a folder of merged tables.
+/// Combines the learned models in a folder of merged tables, if their label is wanted.
 ///
 /// # Errors
 /// The file is missing or damaged, the wanted models have several labels, or fewer than three vehicles have a wanted

@@ -1,8 +1,8 @@
 //! Tracks use and wear during a log: charge moved, and the learned capacity of the weakest cell.
 //!
 //! Use is counted in equivalent full cycles (charge moved divided by twice the rated capacity). Cycles and capacities
-//! are known at the ends of half-cycles. Between the ends, the cycles are interpolated, and the capacities keep their
-//! last value.
+//! are known at the end of each half-cycle (a charge or a discharge). Between these times, the cycles are interpolated,
+//! and the capacities keep their last value.
 
 use std::collections::BTreeMap;
 
@@ -51,8 +51,8 @@ impl Track {
         *moved_ah += charge_ah;
         let cycles = *moved_ah / (2.0 * self.rated_ah);
         let most = self.cycles.last().map_or(0.0, |last| last.1);
-        // All cells of a string move the same charge. A cell without estimates counts too little, so the largest count
-        // applies.
+        // The same charge flows through all cells of a string. The count of a cell without estimates is too small, so
+        // the largest count applies.
         if cycles > most {
             self.cycles.pop_if(|last| last.0 == time);
             self.cycles.push((time, cycles));

@@ -1,8 +1,8 @@
 //! Reads the true capacities of a log from a CSV file in the same folder.
 //!
-//! The columns distinguish two formats. A table with a column `cell` was written by `simulate --truth`. It contains the
-//! capacity of every cell from the full to the empty open-circuit voltage. A table with `cycle` and `type` has the
-//! format of `score --cycles`. It contains the published capacity of one cell for each discharge, at the load of this
+//! There are two formats. A table with a column `cell` was written by `simulate --truth`. It contains the capacity of
+//! every cell from the full to the empty open-circuit voltage. A table with the columns `cycle` and `type` has the
+//! format of `score --cycles`. It contains, for each discharge of one cell, the published capacity at the load of this
 //! discharge.
 //!
 //! For a log `NAME.log`, `NAME.csv` etc., the files `NAME.truth.csv`, `NAME_truth.csv` and `NAME_cycles.csv` are
@@ -61,7 +61,7 @@ pub struct Truth {
 }
 
 impl Truth {
-    /// Reads a truth table in either format.
+    /// Reads a table of true capacities in either format.
     /// # Errors
     /// The file cannot be read, has neither format, or a field is wrong.
     pub fn read(path: &Path) -> Result<Self, TableError> {
@@ -98,7 +98,8 @@ impl Truth {
     }
 }
 
-/// Reads a table that `simulate --truth` wrote. Keeps only the rows at which a capacity changed by more than 0.02 %.
+/// Reads a table that `simulate --truth` wrote. Keeps a row only if the capacity of its cell has changed by more than
+/// 0.02 % since the last kept row.
 fn read_simulated(mut table: CapacityTable) -> Result<Truth, TableError> {
     let (mut cells, mut span): (BTreeMap<CellIndex, Vec<(Timestamp, f64)>>, _) = (BTreeMap::new(), None);
     while let Some(row) = table.next_row()? {

@@ -8,7 +8,7 @@
 use crate::alarm::{AlarmChange, AlarmEngine, AlarmInput, Change, Rule, RuleConfig, Severity};
 use crate::quantity::{CellIndex, Timestamp};
 
-/// Maximum number of raises, and of clears, that are stored per threshold and log. More are only counted.
+/// Maximum number of raises, and of clears, that are stored per threshold and log. Further ones are only counted.
 const MAX_KEPT: usize = 20_000;
 
 /// A raised alarm.

@@ -1,10 +1,11 @@
 //! Implements `--set KEY=V1,V2`: replaces values of a configuration, and builds all combinations of the replaced
 //! values.
 //!
-//! Input: the file of a configuration, and choices (one per `--set`). Output: one checked configuration per combination
-//! with the number of its replay, the original first. Combinations share a replay if their configurations differ only
-//! in `[[alarm]]` tables. Tables of the rule `input_missing` are an exception, because their time-outs also affect the
-//! inputs of the alarms. A combination that is not a valid configuration is left out and reported.
+//! Input: the file of a configuration, and choices (one per `--set`). Output: the original configuration, then one
+//! checked configuration per combination. Each has the number of its replay. Combinations share a replay if their
+//! configurations differ only in `[[alarm]]` tables. Tables of the rule `input_missing` are an exception: if they
+//! differ, the replays are separate, because the time-outs of this rule also affect the inputs of the alarms. A
+//! combination that is not a valid configuration is left out and reported.
 //!
 //! | key | meaning |
 //! | --- | --- |
@@ -140,7 +141,7 @@ pub fn grid(path: &Path, choices: &[Choice]) -> Result<VariantGrid, Vec<String>>
                 if first_refused.is_empty() {
                     let set: Vec<_> =
                         grid.keys.iter().zip(&combination).map(|(k, (v, _))| format!("{k}={v}")).collect();
-                    // The note quotes at most three faults, of the first invalid combination.
+                    // The note quotes at most three faults of the first invalid combination.
                     first_refused = faults.iter().take(3).map(|f| format!("{}: {f}", set.join(" "))).collect();
                 }
             }
@@ -193,7 +194,7 @@ fn replay_key(root: &Table) -> String {
     if let Some(Value::Array(alarms)) = root.get_mut("alarm") {
         alarms.retain(|alarm| rule_of(alarm) == Some(Rule::InputMissing.name()));
     }
-    // A parsed table can always be written. If it could not, no replay would be shared.
+    // A parsed table can always be written as text. If this failed, its debug form would serve as the key.
     toml::to_string(&root).unwrap_or_else(|error| format!("{error} {root:?}"))
 }
 

@@ -15,7 +15,7 @@ pub(super) const RECORD: &str = "vehicle.json";
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Vehicle {
-    /// Name of the vehicle, of its folder, and in the first column of its tables.
+    /// Name of the vehicle. Its folder has this name, and the first column of its tables contains it.
     pub vehicle: String,
     /// Size of the vehicle's logs (bytes).
     pub bytes: u64,

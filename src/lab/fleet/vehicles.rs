@@ -79,7 +79,7 @@ fn is_log(name: &OsStr) -> bool {
     !name.starts_with('.') && !is_table && [".log", ".journal", ".csv"].iter().any(|ending| name.ends_with(ending))
 }
 
-/// Writes the manifest: one JSON document per line.
+/// Writes the manifest (the list of vehicles): one JSON document per line.
 ///
 /// # Errors
 /// A path is not valid UTF-8.

@@ -1,7 +1,7 @@
 //! Evaluates the alarms of every combination of settings in each log.
 //!
-//! Combinations that differ only in alarms share one replay per log ([`VariantBatch`]). The life (charge moved, learned
-//! capacity) comes from the original configuration.
+//! Combinations that differ only in alarms share one replay per log ([`VariantBatch`]). The charge moved and the
+//! learned capacity of a log come from a replay with the original configuration.
 
 use std::path::PathBuf;
 
@@ -35,7 +35,7 @@ pub struct WhatifSettings<'a> {
     pub access: LogAccess<'a>,
     /// Capacity at which the life of a cell ends (Ah).
     pub end_of_life_ah: f64,
-    /// Whether the limit applies to the usable capacity, if its computation is configured.
+    /// Whether `end_of_life_ah` limits the usable capacity (only if the usable capacity is configured).
     pub judges_usable: bool,
     /// Maximum time from a correct alarm to the end of life; `None` = unlimited.
     pub horizon: Option<Horizon>,

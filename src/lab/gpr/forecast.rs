@@ -4,13 +4,14 @@
 //! *window* at row t contains, for every column, the value and the last differences ([`ForecastPlan::lags`] values per
 //! column). For every output and every horizon h, a separate Gaussian process predicts the change from row t to row t +
 //! h (a direct forecast). Errors of one step therefore do not enter the next step, and each horizon has its own noise.
-//! If the window contains no information, the forecast is the mean change, which is close to persistence (the value
-//! stays constant).
+//! If the window contains no information about the change, the forecast is the mean change, which is close to
+//! persistence (the value stays constant).
 //!
 //! The interval is calibrated on forecasts of known rows. The process is fitted to the first training rows and
-//! forecasts the next block of rows, and so on block by block. The ratios |error| / standard deviation determine the
-//! local width of the interval ([`spread`]). Leaving out single rows would not work, because windows overlap and the
-//! neighbours of a row reveal its value. No row after the origin (the end of the known rows) is used.
+//! forecasts the block of rows after them. This is repeated for each later block. The ratios |error| / standard
+//! deviation determine the local width of the interval ([`spread`]). Leaving out single rows would not work, because
+//! windows overlap and the neighbours of a row reveal its value. No row after the origin (the end of the known rows) is
+//! used.
 
 mod spread;
 mod windows;

@@ -1,5 +1,9 @@
-//! Draws pictures of regressions (predicted over measured values, a section of rows with its interval, the error of
-//! every row) and of forecasts (the fan at the origin, error and coverage over the horizon).
+//! Draws pictures of regressions and of forecasts.
+//!
+//! A regression has three charts: predicted over measured values, a section of rows with 95 % intervals, and the error
+//! of every row. A forecast starts at a row, the origin. Its charts show the forecast after the origin with the 95 %
+//! intervals (the fan). If later rows are known, they also show the error and the coverage of the forecasts by the
+//! number of rows ahead.
 
 use std::path::Path;
 
@@ -7,7 +11,7 @@ use super::forecast::{HorizonForecast, OutputForecast, TableForecast};
 use super::{ColumnTable, CrossValidation, table};
 use crate::chart::{self, Axis, Chart, Ink, Layer, Picture, PlotError, Point, Shape};
 
-/// Number of rows of the section that is drawn with its interval. Single rows remain visible.
+/// Number of rows in the chart with 95 % intervals. With more rows, single rows would not be visible.
 const STRETCH: usize = 150;
 
 /// Draws the cross-validation of every kernel as SVG files.
@@ -179,7 +183,7 @@ fn coverage(output: &OutputForecast) -> Chart {
     Chart::new(title, "rows ahead", Axis::number("inside, %").within(0.0, 100.0), layers)
 }
 
-/// Draws the forecasts of the last scored horizon, with the measured values, at the forecast rows.
+/// Draws the forecasts of the longest scored horizon (number of rows ahead) together with the measured values.
 fn held_out(data: &ColumnTable, output: &OutputForecast) -> Chart {
     let Some(horizon) = output.horizons.iter().rfind(|h| h.score.is_some()) else { return Chart::default() };
     let for_row = |row: usize| (row + horizon.steps) as f64 + 1.0;

@@ -1,11 +1,12 @@
 //! Determines the SOC in the first cycles of an ageing cell. Full charges and full discharges alternate, and the record
 //! has no charge counter.
 //!
-//! The SOC is anchored at two points. At the end of every full charge, where the charger stops, the SOC is 1. At the
-//! knee, a discharge falls through a fixed voltage ([`KNEE_SHARE`]). The SOC at the knee is the same in every
-//! discharge, because the voltage falls fastest there and little charge is left. These anchors prevent capacity fade
-//! and the gain error of the charger's current from distorting the curves. At the cut-off under load, the mean SOC is
-//! assumed to be [`SOC_LEFT`]. Half-cycles before the first discharge start at an unknown SOC and are left out.
+//! The SOC is anchored at two points. The first point is the end of every full charge, where the charger stops: the SOC
+//! is 1. The second point is the knee, where a discharge falls through a fixed voltage ([`KNEE_SHARE`]). The SOC at the
+//! knee is the same in every discharge, because the voltage falls fastest there and little charge is left. These
+//! anchors prevent capacity fade and the gain error of the charger's current from distorting the curves. At the cut-off
+//! under load, the mean SOC is assumed to be [`SOC_LEFT`]. Half-cycles before the first discharge start at an unknown
+//! SOC and are left out.
 
 use super::{MeasuredPart, charge_ah};
 use crate::filter::median;
@@ -14,7 +15,7 @@ use crate::filter::median;
 pub(crate) const SOC_LEFT: f64 = 0.045;
 /// Voltage of the knee, as a share of the range from the lowest to the highest voltage: 3.0 V for 2.7 to 4.2 V.
 const KNEE_SHARE: f64 = 0.2;
-/// A row is under load above this share of the median current of the discharge.
+/// A row is under load if its current exceeds this share of the median current of the discharge.
 const LOADED_SHARE: f64 = 0.5;
 /// If the current changes by more than this between two rows (A per Ah of capacity), the row's voltage and current may
 /// belong to different instants.

@@ -1,22 +1,25 @@
-//! Determines the SOC of every raw row. A file that starts at an unknown SOC is rejected.
+//! Determines the SOC of every raw row of a measured part (one record of a battery cycler). A part that starts at an
+//! unknown SOC is rejected.
 //!
-//! 1. A part must start with a full cell. Its first voltage must be within [`REST_SAG_V`] of the highest voltage, or
-//!    within [`LOAD_SAG_V`] if current already flows.
-//! 2. The cycler's charge counter rises during discharge and falls during charge. If it starts within [`COUNTER_NEAR`]
-//!    of 0, SOC = 1 - counter / capacity. If it starts lower, it was reset before the charge, so its first value is
-//!    subtracted. If it starts higher, charge was taken out before the first row, so the part is rejected.
+//! 1. A part must start with a full cell. Its first voltage must be at most [`REST_SAG_V`] below the cell's highest
+//!    allowed voltage, or at most [`LOAD_SAG_V`] below it if a discharge current already flows.
+//! 2. The cycler's charge counter rises during discharge and falls during charge. If its first value is within
+//!    [`COUNTER_NEAR`] of 0, SOC = 1 - counter / capacity. If its first value is lower, the counter was reset before
+//!    the charge, so the first value is subtracted from all values. If its first value is higher, charge was taken out
+//!    before the first row, so the part is rejected.
 //! 3. Without a counter, the current is integrated, starting at SOC 1.
 
 use super::{MeasuredPart, charge_ah};
 
-/// Largest difference between the highest voltage and the voltage of a full cell at rest (V). The voltage relaxes after
-/// a charge, and a charge in the cold ends early.
+/// Largest difference between the highest allowed voltage and the voltage of a full cell at rest (V). The voltage falls
+/// after a charge, and a charge in the cold ends early.
 const REST_SAG_V: f64 = 0.1;
-/// Largest difference between the highest voltage and the voltage of a full cell under load (V).
+/// Largest difference between the highest allowed voltage and the voltage of a full cell under load (V).
 const LOAD_SAG_V: f64 = 0.35;
-/// Current above which a cell is under load, as a share of its capacity per hour.
+/// Discharge current above which a cell is under load: current divided by capacity (1/h).
 const LOAD_SHARE: f64 = 0.02;
-/// A counter started at the full cell if its first value is at most this share of the capacity away from 0.
+/// The charge counter was 0 when the cell was full if its first value is at most this fraction of the capacity away
+/// from 0.
 const COUNTER_NEAR: f64 = 0.003;
 
 impl MeasuredPart {

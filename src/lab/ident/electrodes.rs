@@ -12,7 +12,8 @@ use crate::cell::{Electrodes, NegativeMaterial, PositiveMaterial};
 use crate::filter::levenberg_marquardt::{Damping, minimise};
 
 const POINTS: u32 = 51;
-/// Standard deviation of a real cell's voltage from the library's voltage (V). Materials with the same name differ.
+/// Standard deviation of a real cell's voltage from the voltage of the materials in packwatch's library (V). Materials
+/// with the same name differ.
 const MATERIAL_V: f64 = 0.01;
 /// The same standard deviation below [`LOW_SOC`], where curves fall steeply (V).
 const LOW_SOC_V: f64 = 0.03;
@@ -27,10 +28,10 @@ const BOUNDS: [(f64, f64); 4] = [(0.0005, 0.25), (0.4, 0.999), (0.55, 0.9995), (
 const STEPS: usize = 60;
 const DAMPING: Damping =
     Damping { first: 1e-2, fall: 0.3, fall_after_growth: 0.3, growth: 10.0, least: 1e-9, most: f64::INFINITY };
-/// Largest accepted residual (V). Above it, the library lacks the cell's materials. Published cells fit within 5 mV
-/// with their own materials. With most other materials, the residual exceeds 10 mV. The limit is a compromise, because
-/// wrong materials can also fit. The ageing that wrong materials predict can be better or worse than a shift of the
-/// curve along the SOC.
+/// Largest accepted residual (V). If the residual is larger, the library lacks the cell's materials. Published cells
+/// fit within 5 mV with their own materials. With most other materials, the residual exceeds 10 mV. The limit is a
+/// compromise, because wrong materials can also fit. If no materials fit, the curve of an aged cell is predicted by a
+/// shift along the SOC. A prediction with wrong materials can be better or worse than this shift.
 pub const MAX_RESIDUAL_V: f64 = 0.008;
 
 /// The fitted electrodes and their residual.

@@ -20,12 +20,12 @@ use super::record::Record;
 const BLOCK_S: f64 = 100.0;
 /// Upper limit of the error of a block (V); also the error if no temperature has data.
 const MOST_V: f64 = 0.1;
-/// In the error of each node, the mean error at the node's temperature has the weight of data that move this charge (as
-/// SOC).
+/// The error of each node includes the mean error at the node's temperature. The mean error counts like data that moved
+/// this charge (in multiples of the capacity).
 const LEAN_SOC: f64 = 1.0;
 /// Growth of the variance on data outside the fit: 1 + this constant / number of files.
 const UNSEEN: f64 = 3.0;
-/// A file has data near a node if more than this charge, as SOC, was moved there.
+/// A file has data near a node if more than this charge (as a fraction of the capacity) was moved there.
 const VISIT_SOC: f64 = 0.005;
 
 struct NodeSums {

@@ -20,14 +20,14 @@ pub const MIN_ROWS: usize = 50;
 pub const SUPPORTED_S: f64 = 30.0;
 /// A time constant stays within this factor of its starting value.
 const TAU_FACTOR: f64 = 5.0;
-/// Smallest rise of the OCV (V per unit of SOC).
+/// Smallest rise of the open-circuit voltage (OCV), in V per unit of SOC.
 pub const MIN_SLOPE_V: f64 = 0.02;
 /// Steepest rise of the OCV (V per unit of SOC).
 const MAX_SLOPE_V: f64 = 60.0;
 /// Resistances stay within this factor of the starting value.
 const R_FACTOR: f64 = 100.0;
 
-/// An OCV test: voltage over rising SOC at one temperature.
+/// A slow test (a discharge so slow that it shows the OCV): voltage over rising SOC at one temperature.
 #[derive(Debug, Clone, PartialEq)]
 pub struct OcvCurve {
     /// Cell temperature (degrees C).

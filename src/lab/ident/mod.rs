@@ -7,7 +7,8 @@
 //! 3. [`pass`] computes the residuals, and their exact Jacobian from recursive sensitivities.
 //! 4. [`prior`] adds the prior, which keeps the tables smooth.
 //! 5. [`solve`] minimises the cost (projected Levenberg-Marquardt).
-//! 6. [`fit`] runs the whole fit, and determines residuals and nodes without data.
+//! 6. [`fit`] repeats steps 3 to 5 until the cost stops falling. Then it determines the residuals, and the seconds of
+//!    data near each node of the tables.
 //!
 //! For records that start at an unknown SOC, [`unanchored`] estimates the SOC together with the tables. After a fit,
 //! [`error_table`] estimates the model's error, and [`thermal`] fits heat capacity and thermal resistance.

@@ -1,4 +1,5 @@
-//! Defines the parameter vector: for every node the OCV (V), ln R0, and ln R and ln tau of each branch.
+//! Defines the parameter vector of a fit. For every node (a point of the grid of SOC and temperature), it contains the
+//! OCV (V), ln R0, and ln R and ln tau of each RC branch.
 //!
 //! Parameters of one kind are consecutive and in node order (temperature row by temperature row). The capacitance of a
 //! node is C = tau / R.

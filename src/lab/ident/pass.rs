@@ -13,9 +13,9 @@
 //! nodes, and the work per row does not grow with the tables.
 //!
 //! Beyond [`HUBER_V`], the cost grows linearly (Huber), so that errors that no circuit can explain do not distort the
-//! tables. If the SOC is unknown ([`FreeScale`]), each residual is divided by the circuit model's usual error at this
-//! voltage drop and temperature ([`circuit_error_v`]). Without this division, the error in the cold would be mistaken
-//! for lost capacity.
+//! tables. If the SOC is unknown ([`FreeScale`]), each residual is divided by the circuit model's usual error at the
+//! row's voltage drop and temperature ([`circuit_error_v`]). Without this division, the model's larger error in the
+//! cold would be mistaken for lost capacity.
 
 use super::grid::{Corners, Grid, arrhenius};
 use super::parameters::{Layout, ParameterTables};
@@ -29,9 +29,9 @@ pub const HUBER_V: f64 = 0.05;
 const SIGMA_V: f64 = 0.010;
 /// Correlation time of the model error (s). All residuals within this time count as one independent residual.
 const REPEATS_S: f64 = 50.0;
-/// Correlation time if the SOC is unknown (s). A cell with a flat curve (EVE) needs at least this value. For Panasonic
-/// 18650PF cells and a simulated LG M50, values from 50 to 500 s change the mean SOC errors by less than 0.1 points.
-/// Changes of [`DROP_ERROR`] and [`COLD_POWER`] have equally small effects.
+/// Correlation time of the model error if the SOC is unknown (s). The fit of a cell with a flat curve (EVE) needs at
+/// least this value. For Panasonic 18650PF cells and a simulated LG M50, values from 50 to 500 s change the mean SOC
+/// errors by less than 0.1 points. Changes of [`DROP_ERROR`] and [`COLD_POWER`] have equally small effects.
 const FREE_REPEATS_S: f64 = 250.0;
 /// Error of a circuit model, as a share of the voltage drop.
 const DROP_ERROR: f64 = 0.05;
@@ -215,8 +215,8 @@ impl FreeScale<'_> {
     }
 }
 
-/// Adds the residuals and derivatives of a record to `normal`. `scale` multiplies the weights of its rows. If `free` is
-/// given, derivatives with respect to its unknowns are added.
+/// Adds the residuals and derivatives of a record to `normal`. The weights of the record's rows are multiplied by
+/// `scale`. If `free` is given, the derivatives with respect to the unknowns of `free` are also added.
 pub fn accumulate(
     record: &Record,
     scale: f64,
@@ -291,7 +291,8 @@ fn circuit_error_v(drop_v: f64, temperature_c: f64) -> f64 {
 }
 
 /// Returns the cost per second of a residual with the expected error `error_v`, and the weight of its square in the
-/// normal equations. The error depends on the parameters through the voltage drop, so the cost includes its logarithm.
+/// normal equations. The expected error depends on the parameters, because it grows with the voltage drop. Therefore
+/// the cost includes the logarithm of the expected error.
 fn free_cost(residual: f64, error_v: f64) -> (f64, f64) {
     let errors = residual.abs() / error_v;
     let (cost, robust) = if errors <= HUBER_ERRORS {

@@ -1,7 +1,9 @@
-//! Defines the prior of a fit: smooth tables, Arrhenius' law between temperatures, and an OCV near the slow test.
+//! Defines the prior of a fit: smooth tables, Arrhenius' law between temperatures, and an open-circuit voltage (OCV)
+//! near the OCV of a slow test (a slow discharge, if one was measured).
 //!
-//! Each term is a linear combination of node parameters with a target and a standard deviation. The curvature at a node
-//! is the change of the slope times the mean distance to both neighbours.
+//! The parameters are the values of the tables at their nodes (points of SOC and temperature). Each term of the prior
+//! is a linear combination of parameters with a target and a standard deviation. The curvature at a node is the change
+//! of the slope times the mean distance to both neighbours.
 
 use super::grid::{Grid, arrhenius};
 use super::parameters::Layout;
@@ -10,10 +12,11 @@ use super::pass::NormalEquations;
 /// Standard deviations of the prior's terms.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PriorDeviations {
-    /// Second difference over SOC, scaled to the node spacing (V): of the OCV or, with a slow test, of the correction
-    /// to the slow test.
+    /// Second difference over SOC, scaled to the node spacing (V). With a slow test, it is the second difference of the
+    /// correction to the slow test, otherwise of the OCV.
     pub ocv_curvature_v: f64,
-    /// Difference between neighbouring temperatures (V): of the OCV or, with a slow test, of the correction.
+    /// Difference between neighbouring temperatures (V). With a slow test, it is the difference of the correction,
+    /// otherwise of the OCV.
     pub ocv_by_temperature_v: f64,
     /// Deviation of the OCV from the slow test (V) per node; unused without a slow test.
     pub ocv_pull_v: f64,
@@ -76,9 +79,9 @@ impl PriorDeviations {
     };
 
     /// Prior for an ageing cell. Each discharge and charge has one current, so only the first rows separate R0 from the
-    /// branch. R0 therefore hardly varies over SOC, and the time constant stays fixed. Near empty, OCV and branch
-    /// resistance are both steep and cannot be separated. The branch varies only as much as drives allow
-    /// ([`PriorDeviations::SLOW_TEST`]), so that the knee belongs to the OCV.
+    /// RC branch. R0 therefore hardly varies over SOC, and the time constant stays fixed. Near empty, OCV and branch
+    /// resistance are both steep, and the data cannot separate them. The branch resistance may vary only as much as in
+    /// [`PriorDeviations::SLOW_TEST`], so the fit attributes the steep fall of the voltage near empty to the OCV.
     pub const AGEING: Self = Self {
         ocv_curvature_v: 0.5,
         r0_curvature: 0.005,
@@ -102,7 +105,8 @@ struct PriorDensity {
 pub struct Prior(Vec<PriorDensity>);
 
 impl Prior {
-    /// Creates the prior around the starting values `start`. If `slow_test` is set, the OCV in `start` is measured.
+    /// Creates the prior around the starting values `start`. If `slow_test` is set, the OCV in `start` comes from a
+    /// slow test.
     pub fn new(grid: &Grid, layout: &Layout, start: &[f64], slow_test: bool, deviations: &PriorDeviations) -> Self {
         let mut prior = Self(Vec::new());
         let reference = if slow_test { &start[..layout.nodes] } else { &vec![0.0; layout.nodes] };

@@ -50,11 +50,11 @@ pub struct FitRow {
     pub soc: f64,
     /// Seconds that the row represents; 0 = it only advances the branches and does not count in the fit.
     pub weight_s: f64,
-    /// Nodes of the OCV.
+    /// Nodes of the table of open-circuit voltages around this row.
     pub ocv: Corners,
-    /// Nodes of resistances.
+    /// Nodes of the tables of resistances around this row.
     pub resistance: Corners,
-    /// Nodes of time constants.
+    /// Nodes of the tables of time constants around this row.
     pub tau: Corners,
 }
 

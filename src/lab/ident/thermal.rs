@@ -3,7 +3,7 @@
 //!
 //! The surroundings are assumed to have the temperature at which a record starts. Some cells start warmer or colder, so
 //! each discharge is fitted alone, and the medians of the credible results are used. Reversible heat is left out, so
-//! the values are effective for the duty cycle of the data.
+//! the values are effective values, which hold for duty cycles like those of the data.
 
 use super::parameters::ParameterTables;
 use super::record::Record;

@@ -1,13 +1,14 @@
 //! Fits tables to records whose SOC is unknown: ordinary drives and charges that start at any SOC.
 //!
-//! Input: records with the charge taken out since their first row, priors of the open-circuit curve (V, V^2) and of the
-//! resistances, and the capacity on the label (Ah). Output: tables, capacity, and the SOC at which each record starts.
+//! Input: records with the charge taken out since their first row; priors of the open-circuit curve (mean in V,
+//! covariance in V^2) and of the resistances; the capacity on the label (Ah). Output: tables, capacity, and the SOC at
+//! which each record starts.
 //!
 //! `SOC = s_k - (q - o t) / C`. Here q is the charge taken out and t the time since the first row. The parameters are
 //! the tables, the SOC s_k at the start of record k, ln C, and the offset o of the current sensor (A). All parameters
-//! are estimated together (maximum a posteriori, Gauss-Newton in [`super::solve`]). Values on which the records contain
-//! no information stay at the prior. The positions of the rows in the tables depend on the SOC, so every pass computes
-//! them again.
+//! are estimated together (maximum a posteriori, Levenberg-Marquardt in [`super::solve`]). Values on which the records
+//! contain no information stay at the prior. The positions of the rows in the tables depend on the SOC, so every pass
+//! computes them again.
 
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;

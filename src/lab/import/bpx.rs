@@ -33,12 +33,12 @@ const GAS_J_PER_MOL_K: f64 = 8.314_462_618;
 /// Temperatures of the tables relative to the file's reference temperature (K).
 const TEMPERATURES_K: [f64; 6] = [-35.0, -25.0, -15.0, 0.0, 15.0, 30.0];
 
-/// Standard deviation of the voltage error at rest and at the reference temperature (V), because a real cell differs
-/// from its parameters.
+/// A real cell differs from its parameters. Standard deviation of the resulting voltage error, at rest and at the
+/// reference temperature (V).
 const ERROR_AT_REST_V: f64 = 0.010;
 
-/// Share of the voltage drop at 1C in the error (root of the sum of squares), because the formulas hold only for small
-/// currents.
+/// The formulas hold only for small currents. This fraction of the voltage drop at 1C is therefore added to the error
+/// at rest (as the root of the sum of squares).
 const ERROR_OF_DROP: f64 = 0.3;
 
 /// Settings of a conversion.

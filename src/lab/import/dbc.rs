@@ -1,7 +1,7 @@
 //! Finds the signals of a DBC that are probably battery signals, and writes them as the `[input]` part of a
 //! configuration. Only name, unit and range are considered.
 //!
-//! The next candidates for each input are written as comments. The owner must confirm the result; `packwatch discover`
+//! Further candidates for each input are written as comments. The owner must confirm the result; `packwatch discover`
 //! can check the values in a log. A DBC does not show the sign of the current, so the owner must add the sign to the
 //! configuration.
 
@@ -102,7 +102,7 @@ fn largest(signal: &Signal) -> f64 {
     if layout.has_range() { layout.maximum.min(top) } else { top }
 }
 
-/// Joins signals to one pattern and adds points if the names of at least three signals differ only in a number.
+/// If the names of at least three signals differ only in a number, joins these signals to one pattern and adds points.
 fn with_patterns(cells: Vec<Candidate>) -> Vec<Candidate> {
     let names: Vec<(String, &str)> = cells.iter().map(|cell| (String::new(), cell.name.as_str())).collect();
     let found = groups(&names);

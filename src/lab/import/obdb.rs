@@ -3,8 +3,9 @@
 //! The tables are sorted by the identifiers of requests and answers, so the commands of one controller are together.
 //! The licence of the source, CC BY-SA 4.0, also applies to the TOML, which states it.
 //!
-//! Signals are named `NAME.REST`. If all ids of a file start with the same word, REST is the `id` without this word,
-//! and NAME is the given name or this word. Otherwise, REST is the whole `id`, and NAME is the given name or `Car`.
+//! Signals are named `NAME.REST`. If all ids of a file start with the same word, REST is the `id` without this word;
+//! otherwise, REST is the whole `id`. NAME is [`ObdbSettings::name`]. If no name is given, NAME is the common first
+//! word, or `Car` if there is none.
 //!
 //! A file that is not an OBDb signal set is an error. A command or signal that cannot be converted becomes an
 //! [`Exclusion`], and the rest is converted. An unknown field is ignored and causes a warning.
@@ -149,7 +150,8 @@ impl Converter {
         Ok(())
     }
 
-    /// Returns the signals of one command in the order of their bits, without overlaps.
+    /// Returns the signals of one command in the order of their bits. A signal that overlaps an earlier signal is left
+    /// out.
     fn signals(&mut self, place: &str, values: &[Value]) -> Vec<DiagnosticSignal> {
         let mut signals: Vec<DiagnosticSignal> = Vec::new();
         for (index, value) in values.iter().enumerate() {

@@ -1,8 +1,8 @@
 //! Joins signals whose names differ only in one number to a single line with `{n}`.
 //!
-//! A series is a run of signals at rising positions of one answer. One number in their names increases by one, and the
-//! distance of their positions is constant. Leading zeros of the number are dropped, because `{n}` in a pattern matches
-//! a number with any leading zeros.
+//! A series is a run of signals at rising positions of one answer. From each signal to the next, one number in the name
+//! increases by one, and the distance of the positions is the same. Leading zeros of the number are dropped, because
+//! `{n}` in a pattern matches a number with any leading zeros.
 
 use crate::import::{DiagnosticSignal, NumberRange};
 

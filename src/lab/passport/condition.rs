@@ -19,7 +19,8 @@ use crate::quantity::{CellIndex, Channel, Timestamp, catalogue};
 /// Earlier time stamps (before 2001-01-01, s since 1970) are not dates. A clock that was not set starts in 1970, 1980
 /// or 2000, and a log that counts from its own start is shorter than 30 years.
 const FIRST_DATE_S: f64 = 978_307_200.0;
-/// Tolerance (fraction) between two statements of the same value of a new battery, because they may be rounded.
+/// Two statements of the same value of a new battery may be rounded differently. They agree if they differ by at most
+/// this fraction.
 pub(super) const RATED_TOLERANCE: f64 = 0.01;
 
 /// Data from the command line that no record contains; `None` = not given.
@@ -259,7 +260,7 @@ impl<'a> Battery<'a> {
         if terms.moved_before_ah != Some(0.0) {
             return Err("the record does not start with the new battery (--throughput-before-ah 0)".to_owned());
         }
-        // If only the pack's total is measured, one estimated cell represents all cells in series.
+        // If only the pack's total voltage is measured, one estimated cell represents all cells in series.
         let cells = self.series / f64::from(self.config.monitor.sample.cells);
         let value = 1e-3 * self.strings * cells * energy.energy_wh;
         let std = Some(self.config.monitor.health.capacity.current_gain_std * value);
@@ -281,7 +282,7 @@ impl<'a> Battery<'a> {
         self.check_trust()?;
         let is_voltage = |channel: Channel| matches!(channel, Channel::CellVoltage(_) | Channel::PackVoltage);
         let voltages = self.monitor.latest_readings().filter(|(channel, ..)| is_voltage(*channel));
-        // The SOC gets the time of the oldest among the latest voltage readings.
+        // Each voltage channel has a latest reading. The oldest of these readings gives the time of the SOC.
         let oldest = voltages.map(|(_, time, _)| time).min();
         match (self.monitor.pack(), oldest) {
             (Some(pack), Some(time)) => {

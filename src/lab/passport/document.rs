@@ -48,7 +48,8 @@ pub fn passport(standard: Standard, condition: &Condition, manufacturer: Value) 
     if faults.is_empty() { Ok(document) } else { Err(faults) }
 }
 
-/// Returns an empty manufacturer's part: every member that no record contains, with `null` for each value.
+/// Returns an empty manufacturer's part: every member of the structure that packwatch does not fill in, with `null` for
+/// each value.
 pub fn template(standard: Standard) -> Value {
     let places: Vec<String> = places(standard)
         .flat_map(|(_, place)| [joined(place.group, place.value), joined(place.group, place.time)])
@@ -112,7 +113,7 @@ fn places(standard: Standard) -> impl Iterator<Item = (Field, Place)> {
     Field::ALL.into_iter().filter_map(move |field| Some((field, field.place(standard)?)))
 }
 
-/// Adds the counted events to the list of negative events, to which the manufacturer's part may also add.
+/// Adds the counted events to the list of negative events. The manufacturer's part may already contain this list.
 fn add_events(root: &mut Map<String, Value>, condition: &Condition) {
     let events = condition.events().into_iter();
     let mut events =

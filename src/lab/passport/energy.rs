@@ -1,7 +1,8 @@
 //! Computes the energy of a discharge at the configured load.
 //!
 //! A table lists the charge q(v) that the cell delivers until its voltage under load falls to v ([`usable_ah`]). The
-//! energy is the sum of v dq over this table. Further charge is delivered at the cut-off voltage.
+//! energy is the sum of v dq over this table. If more charge was delivered than the table covers, the rest counts at
+//! the cut-off voltage.
 
 use crate::cell::CellModel;
 use crate::health::UsableConfig;
@@ -12,7 +13,7 @@ const VOLTAGES: u32 = 200;
 
 #[derive(Debug)]
 pub(super) struct Discharge {
-    /// Falling voltages (V), each with the charge (Ah) that the cell delivers until then.
+    /// Falling voltages (V), each with the charge (Ah) that the cell delivers until its voltage falls to this value.
     points: Vec<(f64, f64)>,
     cutoff_v: f64,
 }
@@ -24,8 +25,8 @@ impl Discharge {
         let point = |step: u32| {
             let cutoff_v = voltage_v(step);
             let load = UsableConfig { cutoff_v, ..*load };
-            // The additional ageing of the slowest branch is ignored, because it changes the mean voltage only by
-            // millivolts.
+            // The slowest RC branch may have aged more than the other resistances. This difference is ignored, because
+            // it changes the mean voltage only by millivolts.
             (cutoff_v, usable_ah(model, &load, 1.0, capacity_ah, (resistance_ratio, 1.0)))
         };
         Self { points: (0..=VOLTAGES).map(point).collect(), cutoff_v: load.cutoff_v }

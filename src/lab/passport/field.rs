@@ -85,7 +85,7 @@ impl Place {
 }
 
 impl Field {
-    /// All values, in the order of the details.
+    /// All values, in the order of the details file (`--details`).
     pub const ALL: [Self; 17] = [
         Self::FullCycles,
         Self::CapacityThroughput,

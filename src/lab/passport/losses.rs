@@ -4,7 +4,7 @@
 //!
 //! | report | charge |
 //! | --- | --- |
-//! | the current's signal turns bad or stale | lost until the signal is good again, except while its last reading may be used |
+//! | the current's signal turns bad or stale | lost from when its last reading is too old until the signal is good again |
 //! | the buses fall asleep | no charge: the core reports sleep only while no current flows |
 //! | a gap: nothing was recorded | no charge if the buses slept or the pack rested before; otherwise unknown |
 //!
@@ -61,8 +61,8 @@ impl Losses {
     pub(super) fn take_event(&mut self, event: &Event) {
         match event.kind {
             EventKind::SignalBad { channel: Channel::Current, fault } => {
-                // The last reading of a stale signal was used until now. With other faults, the last good reading may
-                // still be used for a limited time.
+                // A stale signal's last reading was used until now, so the loss starts now. With any other fault, the
+                // loss starts later, because the last good reading may still be used for a limited time.
                 let held_s = if fault == Fault::Stale { 0.0 } else { self.limits.current_age_s };
                 self.lost_since.get_or_insert(event.time.plus_secs(held_s));
             }
@@ -113,9 +113,10 @@ impl Losses {
     }
 }
 
-/// Whether `lost_s` is too large a share of `used_s` for a known sum.
+/// Whether the current was missing for so long (`lost_s` of `used_s`) that the sum of the charge counts as unknown.
 pub(super) fn is_too_much(lost_s: f64, used_s: f64) -> bool {
-    // This share tolerates single lost frames. Its error is far below the gain error of a current sensor.
+    // A share of 0.1 % tolerates single lost frames. The error of the sum is then far below the gain error of a
+    // current sensor.
     lost_s > 1e-3 * used_s
 }
 

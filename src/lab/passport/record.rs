@@ -39,7 +39,7 @@ struct Power {
     is_rest: bool,
 }
 
-/// Energy of a replay, integrated over the power of all cells of one string.
+/// Energy of a replay: the power of all cells of one string, integrated over time.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Energy {
     /// Energy of charges plus discharges (Wh).
@@ -62,7 +62,8 @@ impl Energy {
 #[derive(Debug, Default)]
 pub struct Record {
     pub(super) cells: Vec<CellRecord>,
-    /// End of the last half-cycle. It is not the latest time if the clock was set back.
+    /// End of the half-cycle that was recorded last. If the clock was set back, an earlier half-cycle can have a later
+    /// end.
     pub(super) moved_until_ns: Option<i64>,
     /// Reason why charge is missing from the half-cycles; `None` = no charge is missing.
     pub(super) gap: Option<String>,

@@ -1,9 +1,9 @@
 //! Defines the structure that a standard requires of a JSON document, and checks documents against it.
 //!
-//! Input: rows of path and kind, for example `identification.codes[].key|value`. In a path, `|` separates members of
-//! the same structure, `[]` is a list, and `{}` is a list without duplicates. If a member may be missing, the first row
-//! that names it marks it with `?`. A member that the standard does not define is a fault, because a misspelt name
-//! would otherwise stay unnoticed.
+//! Input: rows of a path and the kind of its content, for example the path `identification.codes[].key|value`. In a
+//! path, `a|b` stands for two members `a` and `b` of the same kind, `[]` marks a list, and `{}` marks a list without
+//! duplicates. If a member may be missing, the first row that names it marks it with `?`. A member that the standard
+//! does not define is a fault, because a misspelt name would otherwise stay unnoticed.
 
 use std::collections::HashSet;
 use std::ops::Range;
@@ -75,7 +75,7 @@ impl Shape {
         root
     }
 
-    /// Adds a leaf for each alternative in the path below this object.
+    /// Adds the leaves of a path below this object. A path with `|` has several leaves.
     fn add(&mut self, path: &str, kind: Kind) {
         let (steps, rest) = path.split_once('.').unwrap_or((path, ""));
         let Self::Object(members) = self else { return };
@@ -109,8 +109,8 @@ impl Shape {
         }
     }
 
-    /// Returns a document with every member that is not measured: `null` for each value, and one item in each list.
-    /// `None` = every member is measured.
+    /// Returns a document to fill in. It contains the members that are not measured, with `null` for each value and one
+    /// item in each list. `None` = every member is measured.
     pub(super) fn template(&self, path: &str, is_measured: &dyn Fn(&str) -> bool) -> Option<Value> {
         Some(match self {
             _ if is_measured(path) => return None,
@@ -127,8 +127,8 @@ impl Shape {
         })
     }
 
-    /// Checks a document. A missing object counts as one missing member. If `is_opened` returns true for its path, its
-    /// required members are reported instead.
+    /// Checks a document. A missing object is reported as one missing member. If `is_opened` returns true for the path
+    /// of the object, each of its required members is reported as missing instead.
     pub(super) fn check(&self, document: &Value, is_opened: &dyn Fn(&str) -> bool) -> Verdict {
         let mut verdict = Verdict::default();
         self.check_at("", document, is_opened, &mut verdict);
@@ -227,14 +227,14 @@ impl Kind {
                 let is_key = |text: &str| all.contains(&text) || text.strip_prefix("customKey:").is_some_and(is_word);
                 (text(&is_key), format!("one of {}, customKey:WORD", all.join(", ")))
             }
-            // Leaves never have these kinds.
+            // [`Shape::of_kind`] makes lists and objects of these kinds, not leaves.
             Self::Documents | Self::Facilities | Self::Reading => (true, String::new()),
         };
         (!is_good).then_some(allowed)
     }
 }
 
-/// Whether a text has a form. In the form, `0` matches any digit; other characters match themselves.
+/// Whether a text matches a pattern. In the pattern `form`, `0` matches any digit; other characters match themselves.
 fn has_form(text: &str, form: &str) -> bool {
     let fits = |(byte, expected): (u8, u8)| if expected == b'0' { byte.is_ascii_digit() } else { byte == expected };
     text.len() == form.len() && text.bytes().zip(form.bytes()).all(fits)

@@ -1,4 +1,5 @@
-//! Defines the structure of the two standards as rows of path and kind, derived from their aspect models.
+//! Defines the structure of the two standards for battery passports. Each row states the path of a member and the kind
+//! of its value, as in the aspect model (the schema) of the standard.
 //!
 //! Sources: IDTA 02035-5 "Digital Battery Passport, Part 5: Product Condition" 1.0.1 (aspect model
 //! `product_condition`), and Catena-X `io.catenax.battery.battery_pass` 6.0.0. Units follow the aspect models; see

@@ -1,4 +1,4 @@
-//! Renders the page: one HTML file that contains its style and pictures, without scripts or external resources.
+//! Renders the report as one HTML page that contains its style and pictures, without scripts or external resources.
 
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 
@@ -250,7 +250,7 @@ fn empty(id: &str, title: &str, why: &str) -> Markup {
     html! { section { p.none id=(id) { b { (title) "." } " " (format::capitalised(why)) } } }
 }
 
-/// Explains the difference between the learned capacity and the start of the forecast fan.
+/// Explains the difference between the learned capacity and the start of the forecast, which is drawn as a fan.
 fn gap(data: &Data, outlook: &forecast::Outlook) -> &'static str {
     let last = data.learned.iter().rev().find(|row| row.cell == outlook.cell);
     match (last, outlook.fan.first()) {

@@ -16,7 +16,8 @@ use crate::monitor::ModelState;
 /// Measurement that determines the capacity if the cell model was measured.
 const TEACHES_CAPACITY: &str =
     "A charge from below 20 % to full after an hour of rest, or a discharge over the same range.";
-/// With a smaller share of innovations within their 95 % interval, the intervals are too narrow.
+/// If fewer than this share of the innovations are within their 95 % interval, the estimator's intervals are too
+/// narrow.
 const LEAST_COVERAGE: f64 = 0.8;
 
 #[derive(Debug, Clone, PartialEq)]
@@ -200,7 +201,8 @@ impl Knowledge {
         }
     }
 
-    /// Adds the faults that the cell model cannot show, and the measurement that would reduce its SOC error most.
+    /// Adds the kinds of cell faults that cannot be found with this cell model, and the measurement that would reduce
+    /// the model's SOC error most.
     fn model(&mut self, data: &Data, context: &PageContext<'_>) {
         let sourced = context.model.as_ref();
         if context.diagnosis.is_some() && is_prior(context) {
@@ -232,7 +234,7 @@ fn is_prior(context: &PageContext<'_>) -> bool {
     matches!(state, Some(ModelState::Prior | ModelState::Unfit))
 }
 
-/// The model of LFP cells cannot be learned in use.
+/// States how the cell model can be measured or learned. The model of LFP cells cannot be learned in use.
 fn teaches_model(context: &PageContext<'_>) -> String {
     let in_use = " With a reading per second and rests of some minutes, packwatch may also learn it in use.";
     format!("A measured cell model (packwatch fit).{}", if is_learnable(context) { in_use } else { "" })

@@ -16,7 +16,7 @@ use crate::chart::{
 };
 use crate::{cell_fault_pictures, model_pictures};
 
-/// Text in a store's report in place of a picture that needs samples.
+/// If a report is made from a store, this text replaces the pictures that need samples.
 pub(super) const NOT_STORED: &str =
     "unknown: the history contains learned values but no samples; a report of a replay shows this picture";
 
@@ -197,7 +197,8 @@ fn capacity(data: &Data, context: &PageContext<'_>, outlook: Option<&Outlook>) -
         let median = fan.iter().map(|p| (clock.x(p.time_s), p.median_ah)).collect();
         layers.push(Layer::new("", Ink::Purple, Shape::Dashed(median)));
     }
-    // Capacities measured under load are drawn with the usable capacity, if it is known.
+    // Reference capacities measured under load belong to the picture of the usable capacity. They are drawn here only
+    // if the usable capacity is unknown.
     if !context.reference.is_loaded || series::steps(data, series::usable, false).is_empty() {
         layers.extend(references(data, &clock, context));
     }
@@ -459,7 +460,7 @@ fn coverage(data: &Data) -> Option<Picture> {
     let clock = TimeAxis::of(data);
     let line = life.iter().filter_map(|(time_s, bin)| Some((clock.x(time_s), 100.0 * bin.health.coverage()?)));
     let line: Vec<(f64, f64)> = line.collect();
-    // The axis starts at 80 % if all values are higher.
+    // The axis starts at 80 % if all values are above 80 %.
     let lowest = if line.iter().all(|point| point.1 > 80.0) { 80.0 } else { 0.0 };
     let layers = vec![
         Layer::line("within their own 95 % interval", Ink::Blue, line),

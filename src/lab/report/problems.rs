@@ -1,7 +1,8 @@
 //! Lists what is wrong with the battery, the worst first.
 //!
-//! The list is made from the findings about single cells, the raised alarms, the charge lost by imbalance, and the end
-//! of life. If a finding explains an alarm, both are one problem, so that they cannot contradict each other.
+//! The list is made from the findings about single cells, the raised alarms, the charge that imbalance makes unusable,
+//! and the end of life. If a finding explains an alarm, both become one problem, so that the page cannot contradict
+//! itself.
 
 use std::collections::BTreeSet;
 
@@ -20,9 +21,10 @@ use crate::quantity::{CellIndex, DAY_S};
 /// A pack is out of balance if imbalance makes at least this fraction of its charge unusable, even after subtracting
 /// two standard deviations.
 const OUT_OF_BALANCE: f64 = 0.03;
-/// A fault found within this share of the record counts as present from the beginning, because finding it takes days.
+/// A fault counts as present from the beginning of the record if it was found within this fraction of the record or
+/// within [`STEADY_S`], because finding a fault takes days.
 const BEGINNING: f64 = 0.25;
-/// Time after which a contact that has not grown counts as steady (s).
+/// A contact counts as steady if its resistance has not grown for this time (s).
 const STEADY_S: f64 = 7.0 * DAY_S;
 
 /// Kinds of findings about cells, in the order of the page. Findings about sensors follow.
@@ -47,7 +49,7 @@ pub(super) struct Problem {
 }
 
 impl Problem {
-    /// Adds alarms that this problem explains. The problem becomes at least as severe as the worst alarm.
+    /// Adds alarms that this problem explains. Raises the severity of the problem to that of the worst alarm.
     fn add_alarms(&mut self, alarms: &[&ActiveAlarm<'_>], data: &Data) {
         self.condition = alarms.iter().map(|alarm| condition_of(&alarm.row.severity)).fold(self.condition, Ord::max);
         self.note = format!("{}{}", self.note, alarm_notes(alarms, data)).trim_start().to_owned();
@@ -65,7 +67,7 @@ pub(super) fn problems(data: &Data, context: &PageContext<'_>, outlook: Option<&
         note: String::new(),
         is_alarm: false,
     }));
-    // Problems of the same condition keep their order, except that those with a raised alarm come first.
+    // Among problems of the same condition, those with a raised alarm come first. Otherwise, the order is kept.
     problems.sort_by_key(|problem| std::cmp::Reverse((problem.condition, problem.is_alarm)));
     problems
 }
@@ -124,7 +126,8 @@ fn is_over(data: &Data, context: &PageContext<'_>, outlook: Option<&Outlook>) ->
     is_below || outlook.is_some_and(Outlook::is_over)
 }
 
-/// Groups findings by kind, and contacts also by growth. A finding about a pair of channels is its own group.
+/// Groups findings by kind. Contacts are also grouped by whether their resistance grows. A finding about a pair of
+/// channels is its own group.
 fn of_findings<'a>(findings: &'a [CellFault], data: &Data) -> Vec<Vec<&'a CellFault>> {
     let key = |found: &CellFault| (found.kind, Growth::of(found, data));
     let mut groups: Vec<Vec<&CellFault>> = Vec::new();
@@ -184,7 +187,7 @@ fn finding(group: &[&CellFault], raised: &[ActiveAlarm<'_>], data: &Data) -> Pro
     }
 }
 
-/// Writes one sentence per rule, severity and day that states since when the alarm is raised.
+/// Writes one sentence for each rule, severity and day. The sentence states since when the alarms are raised.
 fn alarm_notes(alarms: &[&ActiveAlarm<'_>], data: &Data) -> String {
     let day = |since_s: f64| (since_s / DAY_S).floor();
     let mut notes: Vec<((&str, &str), f64, Vec<usize>)> = Vec::new();
@@ -204,8 +207,8 @@ fn alarm_notes(alarms: &[&ActiveAlarm<'_>], data: &Data) -> String {
     notes.into_iter().map(note).collect()
 }
 
-/// Formats the sizes of the findings in the unit of [`sentence`]: a single size with its standard deviation, otherwise
-/// the smallest and the largest.
+/// Formats the sizes of the findings in the unit that [`sentence`] uses. One finding gives its size and standard
+/// deviation, several findings give the smallest and the largest size.
 fn sizes(group: &[&CellFault]) -> String {
     let (scale, digits) = match group[0].kind {
         CellFaultKind::Contact => (100.0, 0),
@@ -278,7 +281,8 @@ impl Growth {
         let Some((first_s, last_s)) = data.ends_s() else { return Some(Self::Unknown) };
         let since_s = found.since.secs();
         let is_late = since_s - first_s > (BEGINNING * (last_s - first_s)).max(STEADY_S);
-        // The resistance has grown if it exceeds the first reported value by two standard deviations of the difference.
+        // The resistance has grown if it exceeds the first reported value by more than two standard deviations of the
+        // difference.
         let first = found.cells.and_then(|cells| data.first_sizes.get(&(found.kind, cells.0)));
         let has_grown = first.map(|first| found.size.mean - first.mean > 2.0 * found.size.std().hypot(first.std()));
         if is_late || has_grown == Some(true) {

@@ -50,8 +50,8 @@ pub fn read(path: &Path) -> Result<Reference, TableError> {
     Ok(reference)
 }
 
-/// Removes points whose capacity differs by at most 0.02 % from that of the previous kept point. The first and the last
-/// point always stay.
+/// Removes each point whose capacity differs by at most 0.02 % from the capacity of the last point that was kept. The
+/// first and the last point always stay.
 fn thin(points: &mut Vec<(f64, f64)>) {
     let last = points.last().copied();
     let mut kept_ah = f64::INFINITY;

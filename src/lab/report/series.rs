@@ -1,4 +1,5 @@
-//! Computes series over the life of a pack: the worst cell and the range over all cells after every half-cycle.
+//! Computes series over the life of a pack: the worst cell and the range over all cells after every half-cycle (a
+//! charge or a discharge).
 
 use super::data::{CapacityRecord, Data};
 use crate::filter::ends;

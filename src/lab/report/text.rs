@@ -1,10 +1,10 @@
-//! Formats the beginning of the page as text for the terminal.
+//! Formats the first part of the report page (problems and key figures) as text for the terminal.
 
 use super::context::PageContext;
 use super::data::Data;
 use super::{forecast, summary};
 
-/// Content of the beginning of the page.
+/// Content of the first part of the report page.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Verdict {
     /// What is wrong, the worst first, with the advice. If nothing is wrong, a single entry says so.
@@ -16,7 +16,7 @@ pub struct Verdict {
 }
 
 impl Verdict {
-    /// Evaluates the data in the same way as the page.
+    /// Evaluates the data in the same way as the report page.
     pub fn of(data: &Data, context: &PageContext<'_>) -> Self {
         let summary = summary::of(data, context, &forecast::outlook(data, context));
         let known = summary.knowledge.tiles.into_iter().map(|tile| {

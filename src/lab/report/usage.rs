@@ -6,7 +6,7 @@ use crate::health::UseRecord;
 use crate::health::use_record::LimitUse;
 
 /// Returns the rows of the limits: name, time beyond the limit, number of events, time with a known value, time with an
-/// unknown value, extreme value. A limit that was not configured has no numbers.
+/// unknown value, extreme value. If no limit was configured or no value was known, columns two to four have no numbers.
 pub(super) fn limits(record: &UseRecord) -> impl Iterator<Item = Vec<String>> {
     let UseRecord { temperature_c, voltage_v, current_a, .. } = record;
     let charge_a = current_a.lowest.map(|lowest_a| (-lowest_a).max(0.0));

@@ -1,7 +1,8 @@
 //! Computes baselines for comparison with forecasts of remaining life: a straight line through the last points, and a
 //! least-squares double exponential.
 //!
-//! Input: points of [use, capacity]. Output: the use at which the curve first falls below the threshold.
+//! Input: points of [use, capacity]; use is counted in cycles or days. Output: the use at which the curve first falls
+//! below the threshold.
 
 const STEPS: u32 = 20_000;
 /// First step of the search, and the step below which the search ends. Exponents have the unit 1 / (use at the last

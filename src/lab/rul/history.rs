@@ -99,7 +99,7 @@ impl UseCounter {
         reading
     }
 
-    /// Adds the time since the previous line, minus the use after that line, to the rest.
+    /// Adds to the rest the time since the previous line, minus the time in which the cell was in use after that line.
     fn pass(&mut self, time: Timestamp) {
         if let Some(last) = self.last {
             self.rest_days += (time.since(last) / 86_400.0 - self.used_days).max(0.0);

@@ -1,10 +1,12 @@
-//! Finds the end of a cell's life: the use at which the isotonic (non-increasing least-squares) fit of the capacities
-//! falls below the threshold.
+//! Finds the end of a cell's life: the use (cycles or days) at which the isotonic (non-increasing least-squares) fit of
+//! the capacities falls below the threshold.
 
 use super::History;
 
 /// Returns the use at which the fit falls below the threshold; `None` = the fit never falls below the threshold, or
-/// starts below it. If the threshold lies between the capacities of the two readings, the use is interpolated.
+/// starts below it. The use lies between two readings: the first reading at which the fit is below the threshold, and
+/// the reading before it. If the threshold lies between their measured capacities, the use is interpolated. Otherwise,
+/// returns the use of the later reading.
 pub fn end_of_life(history: &History, threshold_ah: f64) -> Option<f64> {
     let capacities: Vec<f64> = history.rows.iter().map(|row| row.capacity_ah).collect();
     let line = non_increasing(&capacities);

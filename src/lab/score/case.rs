@@ -1,4 +1,4 @@
-//! Runs one file in one case through the monitor and scores it.
+//! Runs one file through the monitor with the initial conditions of one case, and scores the result.
 
 use std::ops::Range;
 use std::path::PathBuf;
@@ -43,12 +43,14 @@ pub struct Case {
     pub capacity_error_percent: f64,
     /// Offset of the current sensor (A), added to every measured current.
     pub current_offset_a: f64,
-    /// Seed of the random windows. The monitor receives only the rows in the windows; `None` = it receives all rows.
+    /// Seed of the random windows (one part of each half-cycle). The monitor receives only the rows in the windows.
+    /// `None` = the monitor receives all rows.
     pub seed: Option<u64>,
 }
 
 impl Case {
-    /// Describes the case. The two given names are used for the errors of capacity and current.
+    /// Describes the case in words. `capacity` and `current` are the names to use for the errors of capacity and
+    /// current.
     pub fn words(&self, separator: &str, [capacity, current]: [&str; 2]) -> String {
         let mut words = vec![match self.start {
             Start::Full => "full".to_owned(),
@@ -63,7 +65,7 @@ impl Case {
     }
 }
 
-/// One file in one case.
+/// Score of one file in one case.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct CaseScore {
     /// The file.
@@ -78,7 +80,8 @@ pub struct CaseScore {
     pub reading: TableReading,
     /// Rows fed to the monitor.
     pub rows: usize,
-    /// Number of values that no frame can carry.
+    /// Number of measured values that did not reach the monitor, because no CAN frame of the configuration can carry
+    /// them.
     pub uncarried_values: usize,
     /// Number of filter resets.
     pub resets: usize,
@@ -101,8 +104,8 @@ pub struct CaseScore {
 /// Runs `file` through the monitor.
 ///
 /// # Errors
-/// The file has no truth or never reaches the start of the case, the initial SOC is out of range, or a plot cannot be
-/// written.
+/// The file has no true SOC or never reaches the start of the case, the initial SOC is out of range, or a plot cannot
+/// be written.
 pub(super) fn run(
     job: &ScoreJob,
     file: &MeasuredFile,

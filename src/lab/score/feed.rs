@@ -1,4 +1,5 @@
-//! Feeds the rows of a measured file to the monitor as frames on a bus, with the ticks of the driver between them.
+//! Feeds the rows of a measured file to the monitor as frames on a bus. Between the rows, the replay driver sends the
+//! monitor ticks (inputs that report the passing of time).
 
 use crate::can::decode::SensorIndex;
 use crate::filter::ScalarGaussian;
@@ -6,7 +7,8 @@ use crate::monitor::{Downtime, ModelState, MonitorConfig, Outputs, Snapshot};
 use crate::quantity::{CellIndex, Channel, Timestamp};
 use crate::replay::MonitorDriver;
 
-/// Assumed time between the latest row and a part whose start is unknown (ns).
+/// A measured file can have several parts. If the start time of a part is unknown, the part is assumed to start this
+/// long after the latest row (ns).
 pub(super) const UNKNOWN_GAP_NS: i64 = 1_000_000_000;
 
 /// Learned state of a monitor.
@@ -23,7 +25,7 @@ pub struct Learned {
 pub(super) struct Feeder(MonitorDriver);
 
 impl Feeder {
-    /// Creates a monitor that has received no row, in the learned state if one is given.
+    /// Creates a monitor. If `learned` is given, the monitor starts from that state.
     pub(super) fn new(config: MonitorConfig, sleep_gap_s: f64, learned: Option<&Learned>) -> Self {
         let mut driver = MonitorDriver::new(config, sleep_gap_s);
         if let Some(learned) = learned {

@@ -38,7 +38,7 @@ pub struct LifeScore {
     pub discharges: usize,
     /// Number of discharges in the statistics.
     pub scored: usize,
-    /// Number of unskipped discharges without an estimate or without a published capacity.
+    /// Number of discharges that were not skipped but have no estimate or no published capacity.
     pub left_out: usize,
     /// Mean |estimate - published| (Ah).
     pub mean_abs_error_ah: f64,
@@ -63,7 +63,7 @@ pub struct LifeScore {
 /// Collects the estimates after each discharge from the monitor's events.
 #[derive(Debug, Default)]
 pub(super) struct LifeRecorder {
-    /// Mode of the latest half-cycle, whose capacity event follows.
+    /// Mode of the latest half-cycle. The capacity event of this half-cycle follows.
     mode: Option<Mode>,
     each: Vec<DischargeScore>,
 }

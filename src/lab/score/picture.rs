@@ -8,7 +8,7 @@ use super::soc::SocSample;
 use crate::OF_95;
 use crate::chart::{self, Axis, Chart, Ink, Layer, Picture, PlotError};
 
-/// Names of the errors of capacity and current.
+/// Names, in a title, of the two errors of a case: of its capacity and of its current.
 const WORDS: [&str; 2] = ["capacity", "current"];
 
 pub(super) fn draw(
@@ -48,7 +48,8 @@ fn soc_panel(title: &str, samples: &[SocSample]) -> Chart {
 }
 
 fn error_panel(samples: &[SocSample]) -> Chart {
-    // Errors before settling are much larger, so the axis follows the second half of the run.
+    // Before the estimate has settled, its errors are much larger. The axis is therefore scaled to the second half of
+    // the run.
     let later = &samples[samples.len() / 2..];
     let reach = later.iter().map(|s| s.error_points().abs().max(s.half_width_points())).fold(1.0, f64::max) * 1.5;
     let inside = move |value: f64| value.clamp(-reach, reach);

@@ -17,7 +17,7 @@ pub struct ScoreReport {
     pub config: PathBuf,
     /// Settings of all files and cases.
     pub settings: ScoreSettings,
-    /// The cases.
+    /// The cases (initial conditions of the estimator).
     pub cases: Vec<Case>,
     /// Scores of every file in every case.
     pub scores: Vec<CaseScore>,

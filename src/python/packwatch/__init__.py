@@ -1,7 +1,7 @@
 """Battery health monitoring: the library of packwatch.
 
 Names end with their units (``time_s``, ``current_a``). SOC is a fraction, and positive current is discharge. An unknown value is null in a
-table and NaN in an array, never a default number. An error raises an exception with the error message of the command line.
+table and NaN in an array, never a default number. An error raises an exception with the message that the program ``packwatch`` prints.
 """
 
 from ._errors import ConfigError, DataError, FileError, PackwatchError

@@ -12,7 +12,7 @@ const MAX_LOGGED: usize = 1000;
 /// Counts since the start of the program.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(crate) struct Counts {
-    /// Connections on which the broker accepted the claim of the signals.
+    /// Connections on which the broker accepted packwatch as the provider of the signals.
     pub(crate) connections: u64,
     /// Batches published.
     pub(crate) batches: u64,

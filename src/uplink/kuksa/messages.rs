@@ -32,14 +32,14 @@ pub(crate) struct Datapoint {
     pub(crate) value: Option<Value>,
 }
 
-/// A value; without a type, the value is unknown.
+/// A value; if `typed` is `None`, the value is unknown.
 #[derive(Clone, PartialEq, prost::Message)]
 pub(crate) struct Value {
     #[prost(oneof = "TypedValue", tags = "11, 12, 13, 14, 15, 16, 17, 18, 21, 22, 25, 27")]
     pub(crate) typed: Option<TypedValue>,
 }
 
-/// Types that this program sends, or reads as limits.
+/// Types of the values that this program publishes, or reads as limits of a signal (`allowed`, `min`, `max`).
 #[derive(Clone, PartialEq, prost::Oneof)]
 pub(crate) enum TypedValue {
     #[prost(string, tag = "11")]
@@ -199,8 +199,8 @@ pub(crate) struct GetProviderValueRequest {
     pub(crate) signal_ids: Vec<i32>,
 }
 
-/// A message from the broker. Filters (tag 5) are ignored: every document is published, because all readers see the
-/// same values.
+/// A message from the broker. Filters (tag 5), which ask for a slower rate, are ignored: this program publishes every
+/// status document, because all readers see the same values.
 #[derive(Clone, PartialEq, prost::Message)]
 pub(crate) struct FromBroker {
     #[prost(oneof = "Event", tags = "2, 4, 6")]

@@ -1,9 +1,10 @@
 //! Queues the messages of one connection to the broker. A message is created only when the connection can send it.
 //!
 //! * While the connection cannot send, only the newest batch of values is kept.
-//! * An empty claim follows each batch. The broker reads messages in order, so when it accepts the claim, it has read
-//!   the batch. The acceptance therefore serves as a *receipt* for the batch. The protocol has no other receipt. A
-//!   *check* is an empty claim without a batch.
+//! * A claim is a request for the right to provide signals. An empty claim (for no signals) follows each batch. The
+//!   broker reads messages in order, so when it accepts the empty claim, it has read the batch. The acceptance
+//!   therefore serves as a *receipt* for the batch. The protocol has no other receipt. A *check* is an empty claim that
+//!   is sent without a batch.
 //! * An answer overtakes a waiting batch. See `value_requests` for why the order matters.
 
 use std::collections::VecDeque;
@@ -42,7 +43,7 @@ pub(crate) struct Outbox {
 }
 
 impl Outbox {
-    /// Creates an outbox and the stream of its messages. The stream begins with the claim.
+    /// Creates an outbox and the stream of its messages. The stream begins with `claim`.
     pub(crate) fn open(claim: ProvideSignalRequest) -> (Self, Messages) {
         let (batches, newest) = watch::channel(PublishValuesRequest::default());
         let (answers, waiting) = mpsc::channel(MAX_ANSWERS);
@@ -103,7 +104,7 @@ impl Messages {
                 self.note_unread(ReceiptScope::Check);
                 return Poll::Ready(Some(receipt));
             }
-            // If the outbox is closed, the batches end too.
+            // If the outbox is closed, the stream of batches has ended too, which is handled below.
             Poll::Ready(None) | Poll::Pending => {}
         }
         let Some(batch) = std::task::ready!(Pin::new(&mut self.batches).poll_next(context)) else {

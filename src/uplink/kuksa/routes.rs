@@ -1,9 +1,9 @@
 //! Maps the broker's ids to signals, for one connection.
 //!
-//! Input: the broker's metadata and status documents. Output: the claim, and data points by id. A signal has a route
-//! only if the broker lists its path with the same datatype and a unique id. Ids change when the broker restarts, so
-//! the routes belong to one connection. A value outside the broker's limits is withheld: its data point is sent without
-//! a value.
+//! Input: the broker's metadata and status documents. Output: the claim (the request to be the provider of these
+//! signals), and data points by id. A signal has a route only if the broker lists its path with the same datatype and a
+//! unique id. Ids change when the broker restarts, so the routes belong to one connection. A value outside the broker's
+//! limits is withheld: its data point is sent without a value.
 
 use std::collections::{BTreeMap, HashMap};
 
@@ -42,8 +42,9 @@ pub(crate) struct Routes {
 }
 
 impl Routes {
-    /// Searches the broker's metadata for every signal. The overlay's signals are below `branch`. `is_from_new` states
-    /// whether sums over the life of the battery are known.
+    /// Searches the broker's metadata for every signal. packwatch's own signals, which extend the standard VSS tree
+    /// (the overlay), are below `branch`. `is_from_new` states whether packwatch has watched the battery since it was
+    /// new, so that sums over its life are known.
     pub(crate) fn resolve(metadata: &[Metadata], branch: &str, is_from_new: bool) -> (Self, Vec<SkippedSignal>) {
         let mut uses: HashMap<i32, usize> = HashMap::new();
         let mut by_path: HashMap<&str, &Metadata> = HashMap::new();

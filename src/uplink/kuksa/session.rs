@@ -1,9 +1,10 @@
 //! Serves one connection to the broker, from opening to closing.
 //!
-//! Input: settings, status documents, the request to stop. Output: values, identified by the ids of this connection.
-//! The program lists the metadata, claims the signals, and then sends a batch for each document. If the daemon falls
-//! silent or this program stops, the program sends a batch without values, so that no reader mistakes an old value for
-//! a current one. The connection ends with a reason if the broker closes it or does not answer.
+//! Input: settings, status documents of the daemon, the request to stop. Output: values, identified by the ids that the
+//! broker gave the signals for this connection. The program reads the list of signals from the broker, claims the right
+//! to provide them, and then sends one batch of values for each status document. If the daemon falls silent or this
+//! program stops, the program sends a batch that marks every value as unknown, so that no reader mistakes an old value
+//! for a current one. If the broker closes the connection or does not answer, the connection ends with a reason.
 
 use std::future::Future;
 use std::path::Path;
@@ -28,8 +29,8 @@ use crate::status_stream::Documents;
 
 /// Longest wait for the connection and for the answer to each call.
 const PATIENCE: Duration = Duration::from_secs(5);
-/// Period of pings on an idle connection. A broker that does not answer a ping within [`PATIENCE`] counts as lost, so
-/// the program notices a lost broker within 15 s.
+/// Period of pings on an idle connection. If the broker does not answer a ping within [`PATIENCE`], the connection
+/// counts as lost. The program therefore notices a lost broker within 15 s.
 const PING_PERIOD: Duration = Duration::from_secs(10);
 /// Longest wait for the broker to read the last batch.
 const FAREWELL: Duration = Duration::from_millis(500);
@@ -76,7 +77,7 @@ pub(crate) async fn run(
     Ok(())
 }
 
-/// A connection whose claim the broker has accepted.
+/// A connection on which the broker has accepted this program's claim to provide the signals.
 struct Session {
     routes: Routes,
     outbox: Outbox,
@@ -86,7 +87,8 @@ struct Session {
     receipts: Receipts,
 }
 
-/// Remembers since when the broker owes a receipt; `None` = no receipt is owed.
+/// Remembers since when the broker has not confirmed a batch. The broker confirms with receipts. `None` = all batches
+/// are confirmed.
 #[derive(Debug, Default)]
 struct Receipts {
     owed_since: Option<Instant>,
@@ -97,13 +99,13 @@ impl Receipts {
         self.owed_since.get_or_insert(now);
     }
 
-    /// Handles a receipt. The broker owes the next receipt once the next batch is sent.
+    /// Handles a receipt. The broker must send the next receipt after the next batch.
     fn note_read(&mut self) {
         self.owed_since = None;
     }
 
-    /// Fails if a receipt is overdue. This happens if the broker keeps the connection open but does not read messages
-    /// or send receipts. If no batch was sent, the broker owes no receipt.
+    /// Fails if a receipt is overdue: the broker keeps the connection open, but does not read messages or send
+    /// receipts. While no batch is unconfirmed, no receipt is due.
     fn check(&self, now: Instant) -> Result<(), String> {
         match self.owed_since {
             Some(since) if now.duration_since(since) > UNREAD_LIMIT => {
@@ -176,8 +178,8 @@ impl Session {
         }
     }
 
-    /// Handles the time limits of answers. If the proof that the broker read the latest answer is still missing, sends
-    /// a check.
+    /// Handles the time limits of answers to the broker. If it is still unknown whether the broker has read the latest
+    /// answer, sends a message that the broker must confirm.
     fn handle_time(&mut self) -> Result<(), String> {
         if self.value_requests.handle_time(Instant::now())? && !self.outbox.check() {
             return Err("the broker reads no answers".to_owned());
@@ -185,13 +187,13 @@ impl Session {
         Ok(())
     }
 
-    /// Sends a batch that makes every value unknown, and gives the broker time to read the batch.
+    /// Sends a batch that marks every value as unknown, and gives the broker time to read this batch.
     async fn withdraw(mut self, journal: &mut Journal) {
         self.publish(None, journal);
         drop(self.outbox);
         let until_end = async { while let Ok(Some(_)) = self.incoming.message().await {} };
-        // Waits at most [`FAREWELL`], because the broker may keep the connection open. By then, the broker has had
-        // enough time to read all messages.
+        // Waits at most [`FAREWELL`], because the broker may keep the connection open. This time is enough for the
+        // broker to read all messages.
         let _ = timeout(FAREWELL, until_end).await;
     }
 }
@@ -297,7 +299,7 @@ mod tests {
         let begin = Instant::now();
         let at = |seconds: u64| begin + Duration::from_secs(seconds);
         let mut receipts = Receipts::default();
-        // Without a daemon, nothing is sent for an hour. After this hour, a batch is sent.
+        // The daemon does not run, so the program sends nothing for an hour. Then it sends a batch.
         receipts.note_sent(at(3600));
         assert_eq!(receipts.check(at(3600)), Ok(()));
         receipts.note_read();

@@ -10,7 +10,8 @@ use super::signals::STANDARD_BRANCH;
 /// Longest branch, bytes. The databroker accepts paths of up to 1,000 bytes.
 const MAX_BRANCH_BYTES: usize = 200;
 
-/// The databroker, and the branch of the overlay's signals.
+/// The databroker, and the branch of the overlay's signals. The overlay adds packwatch's own signals to the standard
+/// signals (VSS) that the databroker knows.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct KuksaSettings {

@@ -26,7 +26,7 @@ pub(crate) const STANDARD_BRANCH: &str = "Vehicle.Powertrain.TractionBattery";
 pub(crate) enum Origin {
     /// Defined in VSS, below [`STANDARD_BRANCH`].
     Standard,
-    /// Defined in the overlay, below the configured branch.
+    /// Defined in the overlay (packwatch's extension of VSS), below the configured branch.
     Overlay,
 }
 

@@ -2,14 +2,15 @@
 //! program.
 //!
 //! While the databroker (0.7) waits for an answer (up to a second), it reads nothing else from this program. It
-//! mistakes a late answer for the answer to its next request, which may be about another signal. If an unread batch is
-//! ahead of the answer, the broker must first read the batch, and may read the answer too late. Therefore:
+//! mistakes a late answer for the answer to its next request, which may be about another signal. If an unread batch of
+//! values was sent before the answer, the broker must first read the batch, and may read the answer too late.
+//! Therefore:
 //!
 //! * A request is answered only after the broker has read all earlier messages. If this takes longer than [`DEADLINE`],
 //!   the request gets no answer, and the broker gives its reader the last value.
 //! * Every answer needs a proof that the broker read it in time. The proof is either the broker's next request, if it
-//!   arrives before [`LATEST_PROOF`], or a receipt. Without a proof the connection is closed, which also discards
-//!   answers that wait in the broker.
+//!   arrives before [`LATEST_PROOF`], or a receipt (the broker's confirmation that it has read all messages so far).
+//!   Without a proof the connection is closed, which also discards answers that wait in the broker.
 
 use std::time::Duration;
 

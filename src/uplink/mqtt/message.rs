@@ -5,7 +5,8 @@
 pub struct Message {
     /// Topic of the message.
     pub topic: String,
-    /// Text of the message. An empty retained message makes the broker delete the retained message of this topic.
+    /// Text of the message. If it is empty and the message is retained, the broker deletes its retained message of this
+    /// topic.
     pub text: String,
     /// Whether the broker keeps the message for later readers.
     pub is_retained: bool,

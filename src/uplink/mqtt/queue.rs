@@ -1,7 +1,8 @@
 //! Queue on disk for messages that the broker has not acknowledged, oldest first.
 //!
-//! Input: messages of the recorder. Output: the oldest messages of a class, in order, until they are removed. An added
-//! message survives a power cut and a restart (SQLite with a write-ahead log, flushed at each commit).
+//! Input: messages of the recorder (samples and events). Output: the oldest messages of a class, in order, until they
+//! are removed. An added message survives a power cut and a restart (SQLite with a write-ahead log, flushed at each
+//! commit).
 //!
 //! The number and the size of the messages are limited. A full queue drops its oldest samples. It drops its oldest
 //! events only if it has no samples. Drops are counted, and the counts survive restarts. A damaged file is set aside
@@ -110,9 +111,9 @@ impl Queue {
         self.added.notified()
     }
 
-    /// Adds messages. If `seen` is given, stores it in the same transaction. `seen` is the recorder's text about the
-    /// events it has handled, and the number of events missed since the previous text. [`Self::seen`] returns the text,
-    /// even after a restart. When this function returns, everything is on disk.
+    /// Adds messages. If `seen` is given, stores it in the same transaction. `seen` has two parts: the recorder's text
+    /// about the events it has handled, and the number of events missed since the previous text. [`Self::seen`] returns
+    /// the text, even after a restart. When this function returns, everything is on disk.
     ///
     /// # Errors
     /// Fails if the disk fails or is full.

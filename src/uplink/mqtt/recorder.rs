@@ -20,8 +20,8 @@ use super::payload;
 use super::queue::{Class, Fill, Queue};
 use crate::status_stream::Documents;
 
-/// A document becomes a sample even if it arrives this much before the sample is due, because documents arrive only
-/// about once a second.
+/// A document becomes a sample even if it arrives up to this much before the sample is due. Documents arrive only about
+/// once a second, so the next document could be late.
 const TOLERANCE_S: f64 = 0.5;
 
 /// The events already handled: the daemon's run, which its start identifies, and the number of its latest event.
@@ -38,7 +38,8 @@ pub struct Recorder<'a> {
     period_s: u64,
     due: Option<Timestamp>,
     handled: Option<Handled>,
-    /// Whether another version wrote the queue's record of handled events.
+    /// Whether another version of the uplink wrote the record of handled events into the queue, in a form that this
+    /// version cannot read.
     has_other_note: bool,
     is_numbered: bool,
     works: Cell<bool>,
@@ -113,7 +114,8 @@ impl<'a> Recorder<'a> {
         let handled = match self.handled {
             Some(handled) if is_same_run => handled.count,
             Some(_) => 0,
-            // An earlier version has handled the listed events; later ones may be missing.
+            // It is unknown which events the other version has handled. All events so far count as handled, although
+            // some of them may not have been queued.
             None if self.has_other_note => total,
             None => total - listed,
         };
@@ -131,7 +133,7 @@ impl<'a> Recorder<'a> {
         (events, missed)
     }
 
-    /// Logs the first drop. Logs again only after a document whose messages caused no drop.
+    /// Logs that the full queue drops messages. While each document causes further drops, the log is not repeated.
     fn note_drops(&self, before: Fill, now: Fill) {
         let is_dropping = (before.dropped_samples, before.dropped_events) != (now.dropped_samples, now.dropped_events);
         if is_dropping && !self.drops.get() {

@@ -152,7 +152,8 @@ impl Item {
     }
 }
 
-/// The list of faults. `x-` keys state what the list cannot contain, so that a short list does not look healthy.
+/// The list of faults. The `x-` keys state how many alarms the list omits and which rules could not be judged, so that
+/// a short list does not look healthy.
 fn fault_list(query: &str, document: &StatusDocument) -> Result<Value, Fault> {
     let decoded = query.replace("%5B", "[").replace("%5b", "[").replace("%5D", "]").replace("%5d", "]");
     let state = match decoded.split_once('=') {

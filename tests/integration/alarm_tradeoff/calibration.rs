@@ -6,7 +6,8 @@ use super::life::{Evaluation, Life, RATED_AH, THRESHOLD};
 
 /// Bin edges of the stated probability.
 pub(crate) const EDGES: [f64; 9] = [0.0, 0.01, 0.05, 0.2, 0.5, 0.8, 0.95, 0.99, 1.0];
-/// Half-cycles skipped at the start of a life because the initial capacity still affects the estimate.
+/// Number of half-cycles (charges or discharges) that are skipped at the start of a life, because the initial capacity
+/// still affects the estimate.
 const SETTLING: usize = 10;
 
 /// Probability that the true capacity is below the threshold, with the alarm rule's formula.
@@ -40,11 +41,13 @@ pub(crate) fn bins(fleet: &Fleet) -> Vec<(usize, f64, f64)> {
 /// Capacity errors of the ageing cells. Only measured half-cycles after the first `SETTLING` count.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Errors {
-    /// All in percent of the rated capacity: mean error, standard deviation of the lives' mean errors, standard
-    /// deviation of the error within a life, and stated standard deviation.
+    /// Mean error. It is in percent of the rated capacity, like the next three values.
     pub(crate) mean: f64,
+    /// Standard deviation of the lives' mean errors.
     pub(crate) between_lives: f64,
+    /// Standard deviation of the error within a life.
     pub(crate) within_life: f64,
+    /// Mean of the stated standard deviations.
     pub(crate) stated: f64,
     /// Fractions of evaluations within the stated 68 % and 95 % intervals.
     pub(crate) inside_68: f64,

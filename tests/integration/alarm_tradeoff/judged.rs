@@ -1,4 +1,4 @@
-//! Applies one alarm rule to one life.
+//! Applies one alarm rule to one life: the estimates of a simulated ageing cell, with its true capacity.
 
 use packwatch::alarm::{AlarmEngine, Change, Comparison, Observation, Rule, RuleConfig, Severity};
 use packwatch::quantity::CellIndex;
@@ -43,8 +43,8 @@ pub(crate) const P95: usize = 6;
 pub(crate) struct RuleOutcome {
     /// The evaluation at which the alarm was first raised.
     pub(crate) first: Option<Evaluation>,
-    /// Number of raises while the true capacity was above the threshold. `far_false_raises` counts only those above by
-    /// more than 1 % of the rated capacity.
+    /// Number of times that the alarm was raised while the true capacity was above the threshold. `far_false_raises`
+    /// counts only those at which it was above the threshold by more than 1 % of the rated capacity.
     pub(crate) false_raises: u32,
     pub(crate) far_false_raises: u32,
     /// Number of times that the alarm cleared before the end of life.
@@ -52,18 +52,19 @@ pub(crate) struct RuleOutcome {
 }
 
 impl RuleOutcome {
-    /// Whether the true capacity exceeded the threshold by more than `margin` (fraction of rated) at the first raise.
+    /// Whether the true capacity was above the threshold by more than `margin` (fraction of the rated capacity) when
+    /// the alarm was first raised.
     pub(crate) fn is_false(&self, margin: f64) -> bool {
         self.first.is_some_and(|evaluation| evaluation.true_ah > (THRESHOLD + margin) * RATED_AH)
     }
 
-    /// The first raise, if it came before the end of life.
+    /// The evaluation at which the alarm was first raised; `None` unless this was before the end of life.
     pub(crate) fn in_time(&self, life: &Life) -> Option<Evaluation> {
         self.first.filter(|evaluation| life.end.is_none_or(|end| evaluation.cycle < end.cycle))
     }
 }
 
-/// Alarm change of the rule at each evaluation of a life.
+/// How the rule's alarm changes at each evaluation of a life; `None` = no change.
 pub(crate) fn changes(rule: &Candidate, life: &Life) -> Vec<Option<Change>> {
     let threshold = THRESHOLD * RATED_AH;
     let config = RuleConfig {

@@ -1,9 +1,11 @@
-//! Compares alarm rules on simulated lives: `when = "mean"` and `when = { probability = p }`. Reports the lead time
-//! (from the alarm to the end of life) and the false alarms.
+//! Compares two kinds of alarm rules on simulated lives. With `when = "mean"`, the alarm is raised if the estimated
+//! mean is beyond the threshold. With `when = { probability = p }`, it is raised if the true value is beyond the
+//! threshold with at least the probability p. Reports the lead time (from the alarm to the end of life) and the false
+//! alarms.
 //!
-//! Each simulated life runs through the whole core: a cell with its own fade, sensors with their own errors, frames,
-//! Monitor. Every rule then evaluates the Monitor's capacity estimates. The Monitor itself also runs three of the rules
-//! and must raise their alarms at the same half-cycles.
+//! Each life simulates a cell with its own fade and sensors with their own errors. The simulated frames run through the
+//! whole Monitor. Every rule then evaluates the Monitor's capacity estimates. The Monitor itself also has three of the
+//! rules configured, and must raise their alarms at the same half-cycles.
 //!
 //! A test run simulates a few lives. The whole study has 200 ageing and 100 healthy lives, each with three sensor sets.
 //! It takes some minutes and writes `tests/alarm_tradeoff.md`:

@@ -41,7 +41,8 @@ pub(crate) fn config(profile: &str, more: &str) -> MonitorConfig {
 pub(crate) struct Ecu {
     key: CanKey,
     pub(crate) authentication: Authentication,
-    /// Freshness of the next command; `None` until an announcement arrives.
+    /// Freshness of the next command (a counter that makes every command unique). `None` until the daemon's
+    /// announcement of the allowed values arrives.
     next: Option<u64>,
     announced: u64,
 }
@@ -52,7 +53,7 @@ impl Ecu {
         Self { key, authentication, next: None, announced: 0 }
     }
 
-    /// Handles an announcement. Ignores one with a wrong authenticator or an old freshness.
+    /// Handles an announcement. Ignores an announcement with a wrong authenticator or an old freshness.
     pub(crate) fn handle_frame(&mut self, frame: &Frame) {
         if frame.id() != CanId::standard(FRESHNESS).unwrap() {
             return;

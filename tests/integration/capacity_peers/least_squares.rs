@@ -1,5 +1,5 @@
-//! Estimates the capacity by published least-squares methods. Their input is a list of swings. A swing is a change of
-//! SOC x (fraction) and the charge y (Ah) that caused it, so y = Q x with the capacity Q (Ah). sx and sy are the
+//! Estimates the capacity by published least-squares methods. Their input is a list of swings. A swing is a change x of
+//! the SOC (fraction), with the charge y (Ah) that caused it. If Q is the capacity (Ah), y = Q x. sx and sy are the
 //! standard deviations of x and y.
 //!
 //! G. L. Plett, "Recursive approximate weighted total least squares estimation of battery cell total capacity", J.
@@ -39,7 +39,7 @@ pub(crate) enum Method {
     Awtls,
 }
 
-/// A recursive capacity estimate, to compare with packwatch's.
+/// A recursive capacity estimate, to compare with the estimate of packwatch.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Peer {
     pub(crate) method: Method,

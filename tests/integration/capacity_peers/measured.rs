@@ -1,5 +1,6 @@
-//! Compares capacity estimates with the published capacities of two measured cells (NASA PCoE B0005, B0006). The cells'
-//! records are replayed whole, and in windows (a random part of each record).
+//! Compares the capacity estimates of packwatch and of its peers (the methods in `PEERS`) with the published capacities
+//! of two measured cells (NASA PCoE B0005, B0006). One test replays the cells' whole records, the other only a random
+//! window of each record. A swing is a change of SOC and the charge that caused it.
 //!
 //! Discharges are numbered from 1; scores start at discharge 11. The published capacity first falls below 1.4 Ah at
 //! discharge 125 (B0005) and 109 (B0006).
@@ -50,7 +51,7 @@ fn configuration(folder: &Path, cell: &str, start: f64, held: bool) -> PathBuf {
     let new_ah = if cell == "B0005" { 1.9216 } else { 2.1059 };
     text = text.replace("[pack]\n", &format!("[pack]\ninitial_capacity_ah = {}\n", start * new_ah));
     if held {
-        // Nominal measurements must not change the capacity either.
+        // The capacity measurements get such a large variance that they do not change the capacity either.
         let fixed = "[capacity]\nmethod = \"nominal\"\nnominal_swing = 0.9\nnominal_variance_ah2 = 1e6\nnoise_ah_per_cycle = 0.0\n";
         text = text.replace("[capacity]\n", fixed) + "\n[estimator]\ncapacity_state = \"held\"\n";
     }
@@ -75,7 +76,7 @@ struct Life {
     filter: Vec<(f64, Source)>,
     outer: Vec<(f64, Source)>,
     loaded: Vec<(f64, Source)>,
-    /// Swings of the filter's SOC with the same ends as in `loaded`.
+    /// Swings of the filter's SOC between the same readings as the swings in `loaded`.
     filter_at_ends: Vec<(f64, Source)>,
 }
 
@@ -172,7 +173,8 @@ impl Life {
         self.config.health.usable.as_ref().unwrap()
     }
 
-    /// Converts a capacity to usable capacity. The uncertainty of the resistance is treated as independent.
+    /// Converts a capacity to usable capacity. The uncertainties of the capacity and of the resistance are treated as
+    /// independent.
     fn to_usable_capacity(&self, reported: &DischargeReport, capacity: ScalarGaussian) -> ScalarGaussian {
         let at = |capacity_ah: f64, ratio: f64| {
             usable_ah(&self.config.model, self.usable(), reported.full_soc, capacity_ah, (ratio, 1.0))
@@ -244,12 +246,12 @@ fn heading() {
     println!("| --- | --- | --- | --- | --- | --- |");
 }
 
-/// Allowed excess over the best peer's error if the peers use the filter's SOC (Ah). This SOC contains the capacity
-/// that packwatch has learned, which helps the peers.
+/// Amount (Ah) by which packwatch's error may exceed the best peer's error if the peers use the filter's SOC. This SOC
+/// depends on the capacity that packwatch has learned, which helps the peers.
 const NEAR_AH: f64 = 0.006;
 
-/// Allowed excess over the best peer's error if the peers use voltage swings (Ah). It is an eighth of a percent of
-/// the capacity. The best peer is chosen after the results are known.
+/// Amount (Ah) by which packwatch's error may exceed the best peer's error if the peers use voltage swings. It is an
+/// eighth of a percent of the capacity. The best peer is chosen after the results are known, which favours the peers.
 const LEVEL_AH: f64 = 0.0025;
 
 #[test]
@@ -272,7 +274,7 @@ fn usable_capacity_of_whole_lives_matches_best_peer() {
     }
 }
 
-/// Allowed ratio to the best peer's error, both averaged over all windows.
+/// Allowed ratio of packwatch's error to the best peer's error. Both errors are averaged over all lives in windows.
 const LEVEL: f64 = 1.1;
 
 /// After a gap, the swing and the charge of a `half_cycle` event can disagree. Therefore the filter's swings use the
@@ -302,8 +304,8 @@ fn usable_capacity_from_windows_matches_best_peer() {
         best_ah = best_ah.min(score.mean_absolute);
     }
     assert!(ours.mean_absolute <= LEVEL * best_ah, "{ours:?}, the best peer {best_ah}");
-    // The 95 % interval covers too few true values: it ignores errors of the open-circuit curve that differ between the
-    // ends of a swing.
+    // The 95 % interval contains fewer than 95 % of the true values. It ignores that the open-circuit curve can have
+    // different errors at the two ends of a swing.
     assert!(ours.covered > 0.5, "{ours:?}");
 }
 

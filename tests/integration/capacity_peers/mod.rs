@@ -1,16 +1,19 @@
-//! Compares packwatch's capacity with recursive total least squares (Plett 2011) on the same swings.
+//! Compares packwatch's capacity with the estimates of other methods, the peers, from the same swings. The peers are
+//! recursive least-squares methods (Plett 2011).
 //!
 //! A swing is a change of SOC and the charge that caused it. The peers get swings from three sources:
 //!
-//! - `filter`: the filter's SOC at both ends, with its standard deviation, from the event `half_cycle`. In windows (a
-//!   random part of each record), the ends are the same as for `voltage`.
+//! - `filter`: the SOC of packwatch's filter at both ends of a half-cycle, with its standard deviation, from the event
+//!   `half_cycle`. If only a random part (window) of each record is replayed, the swings have the ends of the swings of
+//!   `voltage`.
 //! - `voltage`: the SOC at both ends from the inverted open-circuit curve (`swings`). The peer's present capacity
 //!   estimate is used only to compute how ageing changes the shape of the curve.
-//! - `filter, capacity held`: the filter's SOC, counted with the wrong initial capacity.
+//! - `filter, capacity held`: like `filter`, but the filter keeps a wrong initial capacity and does not learn it.
 //!
 //! The published capacity of a measured cell is the charge delivered at 2 A, not the capacity between open-circuit
-//! voltages. packwatch's calculation of the usable capacity therefore converts each peer's capacity. It uses the same
-//! resistance and the same full SOC for all peers, so that only the capacities differ.
+//! voltages. Each peer's capacity is therefore converted with packwatch's calculation of the usable capacity. The
+//! conversion uses the same resistance and the same SOC of a full cell for all peers, so that only the capacities
+//! differ.
 //!
 //! `cargo test --workspace --test integration capacity_peers -- --nocapture` prints the tables of tests/candidates.md.
 
@@ -46,7 +49,7 @@ enum Source {
     Voltage(VoltageSwing),
 }
 
-/// A peer's capacity at each of `times_s`, from the swings that began before that time.
+/// A peer's capacity at each of the times `times_s`. Each capacity comes from the swings that began before its time.
 fn follow(
     model: &CellModel,
     config: &CapacityConfig,

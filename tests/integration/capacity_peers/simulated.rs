@@ -1,7 +1,7 @@
-//! Runs the comparison on simulated lives with known true capacity: the life of `config/paper.toml`, a life that ages a
-//! tenth as fast, and a life without ageing (as total least squares assumes). The sensors are as in the scenario
-//! `paper`: voltage noise 5 mV; current noise 20 mA, offset 10 mA and gain error 0.5 %; 1 s samples. The SOC runs from
-//! 30 to 90 %, and the initial capacity is 20 % wrong.
+//! Compares capacity estimates of packwatch and of the peers (other methods) on simulated lives with known true
+//! capacity: the life of `config/paper.toml`, a life that ages a tenth as fast, and a life without ageing (as total
+//! least squares assumes). The sensors are as in the scenario `paper`: voltage noise 5 mV; current noise 20 mA, offset
+//! 10 mA and gain error 0.5 %; 1 s samples. The SOC runs from 30 to 90 %, and the initial capacity is 20 % wrong.
 
 use std::path::Path;
 
@@ -18,9 +18,9 @@ use super::{PEERS, Score, Source, follow, score};
 use crate::support::simulated_cell;
 
 const NEW_AH: f64 = 2.6;
-/// Relative standard deviation and actual relative error of the initial capacity.
+/// Relative error of the initial capacity, and the relative standard deviation that is stated for it.
 const START_STD: f64 = 0.2;
-/// Half-cycles without a score because the initial value still affects every method.
+/// Number of first half-cycles that are not scored, because the initial value still affects every method.
 const SETTLING: usize = 4;
 
 struct CapacityReport {
@@ -133,8 +133,8 @@ fn print(life: &str, start: f64, name: &str, source: &str, (score, last): (Score
 const LIVES: [(&str, f64); 3] = [("none", 0.0), ("0.005 Ah per cycle", 0.005), ("0.05 Ah per cycle", 0.05)];
 const CYCLES: u32 = 48;
 
-/// Allowed excess over the best peer's relative error if the peers use the filter's SOC. This SOC contains the capacity
-/// that packwatch has learned.
+/// packwatch's relative error may be this much larger than that of the best peer with swings from the filter's SOC.
+/// This comparison favours the peers, because the filter counts the SOC with the capacity that packwatch has learned.
 const NEAR: f64 = 0.001;
 
 #[test]

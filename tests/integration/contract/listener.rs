@@ -58,7 +58,8 @@ pub(crate) struct Listener {
     raised_states: [u64; 3],
     entries: BTreeMap<(u64, u64, u64), Entry>,
     pass_ms: i64,
-    /// Number of raised alarms and table checksum of the last digest.
+    /// Number of raised alarms and checksum of the alarm table, from the last digest (a frame that summarises all
+    /// alarms).
     wanted: Option<(u64, u64)>,
     rules: BTreeMap<u64, u64>,
 }

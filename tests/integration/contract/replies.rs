@@ -97,7 +97,7 @@ fn acknowledge_reply_follows_changed_alarm_frames() {
 #[test]
 fn long_downtime_restarts_all_cyclic_frames() {
     for away in [Downtime::Seconds(1.0), Downtime::Seconds(2.3), Downtime::Seconds(60.0), Downtime::Unknown] {
-        // Also stop between the ends of two periods.
+        // The daemon stops at the end of a period, or 0.1 s or 0.6 s later.
         for more_deci in [0, 1, 6] {
             let mut rig = Rig::new("");
             rig.seconds(3);
@@ -136,7 +136,7 @@ fn short_downtime_keeps_cyclic_periods() {
                 *deci = if rig.frames_with(*id).is_empty() { 0 } else { rig.deci };
             }
         }
-        // The periods start with the first tick.
+        // The periods of 1 s start with the first tick of the first run, 0.1 s after the start of the test.
         let due = stopped / 10 * 10 + if stopped % 10 < 1 { 1 } else { 11 };
         let wanted = due.max(restarted + 1);
         assert_eq!(firsts.map(|(_, deci)| deci), [wanted; 2], "{more_deci}: not all at the first tick");
@@ -243,8 +243,8 @@ fn counters(rig: &Rig, id: u32, protection: Protection) -> Vec<i64> {
 /// second.
 const KILLS: [(i64, i64); 5] = [(0, 3), (7, 0), (16, 2), (130, 25), (31, 600)];
 
-/// Kills a daemon with one raised alarm. For each message of [`COUNTED`], returns the counter steps over the kill, and
-/// the minimum and maximum steps if the daemon had not stopped.
+/// Kills a daemon with one raised alarm. For each message of [`COUNTED`], returns the step of the counter over the
+/// kill, and the smallest and largest step that are possible if the daemon does not stop.
 fn steps_over_a_kill(profile: Profile, unstored_deci: i64, away_deci: i64) -> [(i64, [i64; 2]); 4] {
     let mut rig = protected_rig(profile);
     // Raise the alarm and wait for its repetitions. After them the daemon sends the alarm only at its regular period.

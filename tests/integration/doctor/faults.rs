@@ -173,7 +173,8 @@ pub(crate) const FAULTS: &[Fault] = &[
         2,
     ),
     fault(
-        // The pack is at about 10 degrees C, where the number in Fahrenheit still looks plausible.
+        // The pack is at about 10 degrees C. The same temperature in Fahrenheit is the number 50, which also looks
+        // plausible in degrees C.
         "Fahrenheit in the DBC, not converted",
         |b| b.dbc("(0.1,0) [-40|125] \"degC\"", "(0.18,5) [-40|300] \"degF\""),
         &[Topic::Unit],

@@ -1,4 +1,5 @@
-//! Lists further faults in the form of `faults`. `packwatch doctor` once missed each of them.
+//! Lists further faults, in the same form as the module `faults`. An earlier version of `packwatch doctor` missed each
+//! of them.
 
 use packwatch::wiring::Topic;
 
@@ -22,7 +23,7 @@ fn lose(broken: &mut BrokenPack, wanted: &str, of: u32) {
     });
 }
 
-/// If the data belong to the page, writes `value` to two bytes of the data.
+/// If the data belong to the multiplexer page `page`, writes `value` to two bytes of the data.
 fn set(data: &mut [u8], page: u8, at: usize, value: i32) {
     if data[0] == page {
         data[at..at + 2].copy_from_slice(&i16::try_from(value).unwrap().to_le_bytes());

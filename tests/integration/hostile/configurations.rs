@@ -1,5 +1,5 @@
-//! Tests random configurations. Each configuration that `check` accepts must run without a panic and accept its own
-//! stored state.
+//! Tests random configurations. If `check` accepts a configuration, a monitor with this configuration must run without
+//! a panic and must be able to restore the state that it has stored.
 
 use super::*;
 
@@ -78,7 +78,7 @@ fn magnitude(dice: &mut Dice, low: f64, high: f64) -> f64 {
     dice.between(low.ln(), high.ln()).exp()
 }
 
-/// A random cell model, from plausible to absurd.
+/// A random cell model: plausible if `is_usual`, otherwise with absurd values.
 fn cell_model(dice: &mut Dice, capacity_ah: f64, is_usual: bool) -> String {
     let (low_ohm, high_ohm) = if is_usual { (1e-4, 0.2) } else { (1e-9, 1e3) };
     let (low_f, high_f) = if is_usual { (1e2, 1e5) } else { (1e-6, 1e12) };
@@ -108,7 +108,8 @@ fn cell_model(dice: &mut Dice, capacity_ah: f64, is_usual: bool) -> String {
     text
 }
 
-/// A configuration with a few or many random numbers.
+/// Returns the texts of a configuration and of its cell model. A random share of the configuration's numeric keys get
+/// random values.
 fn configuration(dice: &mut Dice, keys: &[NumberKey]) -> (String, String) {
     let is_usual = !dice.one_in(4);
     let capacity_ah = if is_usual { magnitude(dice, 1.0, 100.0) } else { magnitude(dice, 1.1e-3, 0.9e5) };

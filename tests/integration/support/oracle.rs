@@ -1,4 +1,4 @@
-//! Runs `cantools` through `tests/tools/dbc_oracle.py`.
+//! Runs `cantools` as an independent reference (oracle) for DBC decoding, through `tests/tools/dbc_oracle.py`.
 
 use std::collections::HashMap;
 use std::ffi::OsString;

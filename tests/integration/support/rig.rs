@@ -91,7 +91,7 @@ pub(crate) struct Rig {
     pub(crate) out: Outputs,
     pub(crate) events: Vec<Event>,
     pub(crate) frames: Vec<Frame>,
-    /// Sent identifiers, and whether the frame announces a change.
+    /// Identifiers of the sent frames, each with whether the frame announces a change.
     pub(crate) sent: BTreeSet<(CanId, bool)>,
     pub(crate) deci: i64,
     pub(crate) commands_sent: u8,

@@ -14,7 +14,7 @@ use crate::cli::status::{config, duration, mean, number, soc_band, store, with_s
 use crate::quantity::catalogue::Quantity;
 use crate::status::document::StatusDocument;
 
-/// Smallest usable size, columns and lines.
+/// Smallest usable size of the terminal: columns and lines.
 const LEAST: (u16, u16) = (40, 12);
 
 pub(super) fn draw(frame: &mut Frame<'_>, app: &mut App) {

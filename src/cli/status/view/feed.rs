@@ -14,10 +14,11 @@ pub(super) fn now() -> Timestamp {
     Timestamp::from_nanos(Reading::now().realtime_ns)
 }
 
-/// Starts reading the stream socket that belongs to the status socket at `path`. Errors name the status socket, as the
-/// options `--status` and `--socket` do.
+/// Starts reading the stream socket that belongs to the status socket at `path`. Errors name the status socket, because
+/// this is the socket that users choose with `--status` and `--socket`.
 pub(super) fn start(path: PathBuf) -> mpsc::Receiver<FeedUpdate> {
-    // One update is drawn while the next is read. An update that arrives while both places are taken is dropped.
+    // The channel holds one update while the view draws another. An update that arrives while the channel is full is
+    // dropped.
     let (updates, received) = mpsc::channel(1);
     tokio::spawn(async move {
         let handle = |line: Result<&[u8], &str>| {

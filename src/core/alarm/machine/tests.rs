@@ -140,7 +140,7 @@ fn transitions_match_table_for_all_inputs() {
 }
 
 /// Whether the value is known after `input`. A command does not change whether the value is known. The caller handles
-/// the check with an unknown value.
+/// the input that is an unknown value.
 fn is_known_in(state: AlarmState, input: MachineInput) -> bool {
     match input {
         MachineInput::Check(_) => true,

@@ -9,7 +9,7 @@ use std::collections::HashSet;
 
 use super::DbcError;
 
-/// Longest quoted text, in characters.
+/// Maximum number of characters that an error message quotes from the file.
 const MAX_QUOTE: usize = 80;
 
 struct Statement<'t> {
@@ -19,8 +19,9 @@ struct Statement<'t> {
 }
 
 /// Parses the usable statements and adds a fault to `left_out` for every other statement. The returned flag is false if
-/// a statement does not follow the grammar; an invalid identifier does not count. If the usable statements do not form
-/// a DBC, returns the first fault of the whole text.
+/// a statement was left out because it does not follow the grammar. Statements that were left out because of an invalid
+/// identifier do not change the flag. If the usable statements together are not a valid DBC, returns the first fault of
+/// the whole text.
 pub(super) fn parse(text: &str, left_out: &mut Vec<DbcError>) -> Result<(can_dbc::Dbc, bool), DbcError> {
     let mut statements = split(text);
     leave_out_bad_identifiers(&mut statements, left_out);
@@ -54,8 +55,8 @@ fn split(text: &str) -> Vec<Statement<'_>> {
     statements
 }
 
-/// Whether a line begins with a keyword. Indented single keywords do not count, because the list after `NS_` consists
-/// of them.
+/// Whether a line begins with a keyword. An indented line that contains only a keyword does not count, because the list
+/// after `NS_` consists of such lines.
 fn starts_statement(line: &str) -> bool {
     let word = line.trim_start().split([' ', '\t', ':', '\r', '\n']).next().unwrap_or_default();
     let is_keyword = word == "VERSION"
@@ -89,7 +90,7 @@ impl Statement<'_> {
 
     /// Whether the statement defines or describes a message with one of these identifiers.
     fn adds_to(&self, identifiers: &HashSet<String>) -> bool {
-        // The longest form is `BA_ "NAME" SG_ NUMBER`.
+        // The identifier is at most the fourth word, as in `BA_ "NAME" SG_ NUMBER`.
         self.words().take(4).skip(1).any(|word| identifiers.contains(word))
     }
 
@@ -103,17 +104,19 @@ impl Statement<'_> {
     }
 }
 
-/// Removes all statements about messages with an invalid identifier. The `can-dbc` crate would drop the identifier's
-/// upper bits, so that it could equal another identifier.
+/// Removes all statements about messages with an invalid identifier. The `can-dbc` crate would drop the upper bits of
+/// such an identifier, and the rest could equal the identifier of another message.
 fn leave_out_bad_identifiers(statements: &mut Vec<Statement<'_>>, left_out: &mut Vec<DbcError>) {
     let mut bad = HashSet::new();
     for statement in statements.iter() {
         let Some(id) = statement.identifier() else { continue };
         let is_bad = match id.parse::<u64>() {
             Ok(id) if id & 0x8000_0000 == 0 => id > 0x7FF,
-            // Editors mark the identifiers of pseudo messages with bit 30.
+            // Editors set bit 30 in the identifier of a pseudo message (a container for signals that belong to no
+            // message).
             Ok(id) => id > 0xFFFF_FFFF || id & 0x6000_0000 != 0 && !is_pseudo(statement),
-            // The number exceeds 64 bits. The grammar rejects text that is not a number.
+            // A number of more than 64 bits is invalid. Text that is not a number is kept here, because the grammar
+            // rejects it.
             Err(_) => id.bytes().all(|b| b.is_ascii_digit()),
         };
         if !is_bad {

@@ -4,8 +4,9 @@
 //! In: frames. Out: readings. For each signal, a range of raw codes with valid values is computed in advance: the good
 //! codes. The signal's [`Binding`] decodes all other codes. The binding also decodes signals without good codes:
 //! floats, signals of 64 bits or spanning nine bytes, signals whose scale is 0 or not finite, and the direction of the
-//! current. A page consists of the signals that are present with one code of the selector. If the selector has too many
-//! codes for a table of pages, the first binding of each group of signals decodes the selector.
+//! current. A page consists of the signals that are present with one code of the selector. A group consists of
+//! consecutive bindings with the same multiplexer conditions. If the selector has too many codes for a table of pages,
+//! the first binding of each group decodes the selector.
 
 use std::hint::cold_path;
 use std::ops::Range;
@@ -17,7 +18,7 @@ use crate::can::signal::{ByteOrder, SignalPlan, ValueType, float_of_signed};
 use crate::can::{CanId, Frame};
 use crate::quantity::{BusIndex, Fault};
 
-/// Ten bits. Selectors usually have 4 to 8 bits.
+/// Maximum number of selector codes with a page of their own: ten bits. Selectors usually have 4 to 8 bits.
 const MAX_CODES: u64 = 1024;
 /// Maximum number of entries in a page table. Limits the memory if many signals have wide ranges of codes.
 const MAX_GROUPS: usize = 1 << 16;
@@ -83,7 +84,7 @@ impl BitPosition {
     }
 }
 
-/// Converts the good codes of one signal. 64 bytes, one cache line.
+/// Converts the good codes of one signal. The struct has 64 bytes, one cache line.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct LinearSignal {
     channel: Channel,

@@ -163,7 +163,7 @@ impl Receiver {
         Self { counts, ..Self::default() }
     }
 
-    /// Resumes from `stored`, but keeps the counts.
+    /// Takes the state of `stored`, but keeps its own counts.
     pub(crate) fn resume(&mut self, profile: Profile, stored: &Self) {
         let last_valid = stored.last_valid.filter(|counter| *counter <= profile.max_counter());
         *self = Self { last_valid, counts: self.counts, ..stored.clone() };

@@ -304,7 +304,7 @@ fn move_down(message: &mut Message) {
         // The header has two bytes.
         signal.layout.start_bit = signal.layout.start_bit.saturating_sub(16);
     }
-    // Length without the header and with fewer unused bytes.
+    // Without the header, the signals need 22 bits, so 4 of the 8 bytes are enough.
     message.len_bytes = 4;
     message.comment = Some("Authenticated command from another ECU: see PACKWATCH_Freshness.".to_owned());
 }
@@ -439,7 +439,8 @@ fn check_trailer(message: &Message, authentication: Authentication, fault: &mut 
 }
 
 /// Multiplies the steps of Ah signals by the smallest factor of 1, 2, 5, 10, ... with which the largest possible value
-/// fits. This value is twice the rated capacity, or half of it for a standard deviation.
+/// fits. The largest possible value is 2 times the rated capacity; for a standard deviation, it is 0.5 times the rated
+/// capacity.
 fn fit_steps(message: &mut Message, rated_capacity_ah: f64) {
     let largest_ah = |signal: &Signal| rated_capacity_ah * if signal.name.ends_with("Std") { 0.5 } else { 2.0 };
     for is_std in [false, true] {

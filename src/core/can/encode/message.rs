@@ -1,6 +1,7 @@
-//! Prepares a message of a layout for encoding.
+//! Prepares a message of the layout (the DBC of the sent frames) for encoding.
 //!
-//! In: values by signal name. Out: frames. A message that cannot be encoded is rejected with all its faults.
+//! In: values by signal name. Out: frames. If a message cannot be encoded, all its faults are reported. The signals of
+//! a multiplexed message form pages: a frame contains one page, and the multiplexor signal (selector) names it.
 
 use super::layout::{DEFAULT_PERIOD_MS, HEADER_SIGNALS};
 use crate::can::dbc::{Database, FrameFormat, Message, Signal};
@@ -93,7 +94,7 @@ impl OutputMessage {
         })
     }
 
-    /// Checks that every rule has a value signal and a threshold signal, on its own page only.
+    /// Checks that every rule has a value signal and a threshold signal, and that both are on the rule's page only.
     pub(super) fn check_rules(&self, rules: &[&str], faults: &mut Vec<String>) {
         if self.fields.iter().any(|field| field.name == "Rule" && !field.is_multiplexor) {
             faults.push("signal PACKWATCH_Alarm.Rule must be the multiplexor (M)".to_owned());
@@ -151,8 +152,8 @@ impl OutputMessage {
     }
 
     /// Encodes a page. `value` returns a signal's value from its name and its [index](Self::with_places). `counter` is
-    /// the next end-to-end counter, which this function advances. The trailer of an authenticated message stays 0 until
-    /// the caller knows the freshness.
+    /// the next end-to-end counter, which this function advances. If the message is authenticated, its trailer is left
+    /// 0; the caller fills it in when it knows the freshness.
     pub(super) fn frame(
         &self,
         page: u64,
@@ -251,7 +252,8 @@ impl OutputField {
         let code = value.and_then(|value| self.plan.code(value * self.per_inside_unit));
         match code {
             None => self.not_available,
-            // A signal of one bit has no spare code.
+            // The value has the code that means "not available", so a neighbouring code is sent. A signal of one bit
+            // has no other code to spare.
             Some(code) if code == self.not_available && self.plan.length_bits() > 1 => self.neighbour(code),
             Some(code) => code,
         }

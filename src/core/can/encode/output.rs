@@ -2,10 +2,12 @@
 //!
 //! The layout may be any DBC with the message and signal names of the shipped `config/packwatch.dbc`. An unknown value
 //! is sent as the code that the DBC calls "not available". If there is no such code, it is sent as all ones (unsigned),
-//! the lowest code (signed) or NaN (float). If a known value would have the same code, it is sent as the neighbouring
-//! code, except in signals of one bit. The caller keeps the counters of end-to-end protection ([`SendCounters`]).
+//! the lowest code (signed) or NaN (float). If the code of a known value is the code for an unknown value, the
+//! neighbouring code is sent, except in signals of one bit. The caller keeps the counters of end-to-end protection
+//! ([`SendCounters`]).
 //!
-//! A DBC is rejected if signals are missing, or if a value could be mistaken for the value of another rule or page.
+//! A DBC is rejected if signals are missing, or if a receiver could mistake a value for the value of another rule or
+//! page.
 
 use serde::{Deserialize, Serialize};
 
@@ -113,7 +115,7 @@ pub struct HealthFields {
     pub normalized_recharge_period_s: Option<f64>,
     pub usable_capacity_ah: Option<f64>,
     pub usable_capacity_std_ah: Option<f64>,
-    /// Relative to new.
+    /// Relative to a new cell.
     pub resistance_ratio: Option<f64>,
     /// Equivalent full cycles until the end of life, median. This value and the following values are optional in the
     /// DBC.

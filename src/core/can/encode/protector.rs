@@ -1,7 +1,7 @@
 //! Protects generated input frames (CSV replay, simulator) as a sender with end-to-end protection does.
 //!
-//! In: frames in sending order. Each frame of a protected message gets the next counter and its CRC. Other frames are
-//! unchanged, also frames that are too short for the header.
+//! In: frames in sending order. Each frame of a protected message gets the next counter and its CRC. Other frames, and
+//! frames that are too short for the header, stay unchanged.
 
 use crate::can::e2e::Protection;
 use crate::can::guard::GuardConfig;

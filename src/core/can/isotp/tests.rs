@@ -112,7 +112,7 @@ fn refusing_flow_control_ends_message() {
 
 #[test]
 fn can_fd_frames_are_reassembled() {
-    // 20 bytes with a length escape, and 100 bytes in frames of 64.
+    // A message of 20 bytes in one frame with an escaped length, and a message of 100 bytes in frames of 64 bytes.
     let single = [&[0x00, 20][..], &message(20), &[0xCC; 2]].concat();
     let long = message(100);
     let first = [&[0x10, 100][..], &long[..62]].concat();

@@ -37,7 +37,7 @@ pub(super) enum ClaimState {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum ClaimEvent {
-    /// Also after a time without listening.
+    /// The node has started, or listens again after a pause.
     Started,
     ClaimedByStronger,
     ClaimedByWeaker,
@@ -52,7 +52,7 @@ enum ClaimAnswer {
     CannotClaim,
 }
 
-/// As in the table above.
+/// Returns the next state and the frame to send, as in the table of the module header.
 fn next(state: ClaimState, event: ClaimEvent) -> (ClaimState, ClaimAnswer) {
     match (state, event) {
         (ClaimState::Idle | ClaimState::Claiming | ClaimState::Claimed | ClaimState::Lost, ClaimEvent::Started)
@@ -107,7 +107,7 @@ impl AddressClaim {
         (self.name, self.address) == (other.name, other.address)
     }
 
-    /// Also restarts the claim after a time without listening.
+    /// Starts the claim, or starts it again after a time without listening.
     pub(super) fn start(&mut self, now: Timestamp) {
         self.last_sent = None;
         self.send_at = None;
@@ -120,7 +120,7 @@ impl AddressClaim {
         self.handle(now, if by <= self.name { ClaimEvent::ClaimedByStronger } else { ClaimEvent::ClaimedByWeaker });
         match (before, self.state) {
             (ClaimState::Claiming | ClaimState::Claimed, ClaimState::Lost) => Some(NodeEvent::AddressLost { to: by }),
-            // One event per answer, because a flood of claims is answered at a limited rate.
+            // A flood of claims is answered at a limited rate. Report one event per answer, not per claim.
             (ClaimState::Claiming | ClaimState::Claimed, ClaimState::Claiming | ClaimState::Claimed) => {
                 was_answered.then_some(NodeEvent::AddressDefended { against: by })
             }

@@ -12,7 +12,8 @@ use serde::{Deserialize, Serialize};
 use super::trouble_code::{Lamp, Lamps, TroubleCode};
 use crate::quantity::Timestamp;
 
-/// More than a configuration can have (18 rules with three severities give 54), and few enough for a linear search.
+/// Maximum number of followed codes. No configuration has as many (18 rules with three severities give 54), and a
+/// linear search is fast enough.
 const MAX_FOLLOWED: usize = 64;
 
 /// An active code and its lamp.
@@ -31,7 +32,7 @@ struct FollowedCode {
     /// Lamp to send: the present lamp, or a more severe lamp that was not sent yet.
     lamp: Lamp,
     lamp_now: Lamp,
-    /// `None` = the code is not sent.
+    /// Lamp with which the code is now sent; `None` = the code is not sent.
     shown: Option<Lamp>,
     changed_at: Option<Timestamp>,
     /// Whether the latest change is in a message that is still being transferred.
@@ -56,12 +57,12 @@ impl FollowedCode {
         (self.is_active || self.is_unseen).then_some(self.lamp)
     }
 
-    /// `None` = no change.
+    /// Time from which the waiting change may be sent; `None` = no change waits.
     fn due(&self) -> Option<Timestamp> {
         (self.wanted() != self.shown).then_some(spaced(self.changed_at))
     }
 
-    /// The lamp in a message sent at `now`; `None` = the message lacks the code.
+    /// The lamp of this code in a message sent at `now`; `None` = the message does not contain the code.
     fn shown_at(&self, now: Timestamp) -> Option<Lamp> {
         if self.due().is_some_and(|due| due <= now) { self.wanted() } else { self.shown }
     }
@@ -101,7 +102,7 @@ pub(super) struct Codes {
 }
 
 impl Codes {
-    /// Follows at most [`MAX_FOLLOWED`] codes.
+    /// Sets the codes that are active now. At most [`MAX_FOLLOWED`] codes are followed.
     pub(super) fn set(&mut self, now: Timestamp, active: &[ActiveCode], all_known: bool) {
         self.forget_settled(now);
         self.all_known = all_known;
@@ -137,7 +138,7 @@ impl Codes {
         self.known_changed_at = None;
     }
 
-    /// `None` = all changes are sent.
+    /// Time from which the next waiting change may be sent; `None` = all changes have been sent.
     pub(super) fn change_due(&self) -> Option<Timestamp> {
         let known = match (self.all_known, self.all_known_shown) {
             (true, true) | (false, false) => None,
@@ -173,7 +174,8 @@ impl Codes {
         }
     }
 
-    /// Handles the end of a message. The codes that the message changed then stay unchanged on the bus for a second.
+    /// Handles the end of a message's transfer. From then on, the codes that the message changed stay unchanged on the
+    /// bus for a second.
     pub(super) fn sent(&mut self, now: Timestamp) {
         for followed in self.followed.iter_mut().filter(|followed| followed.is_in_flight) {
             followed.changed_at = Some(now);
@@ -181,7 +183,7 @@ impl Codes {
         }
     }
 
-    /// Includes the lamps of codes that do not fit into the message.
+    /// The lamps of all sent codes, including the codes that do not fit into the message.
     pub(super) fn lamps(&self) -> Lamps {
         Lamps::of(self.followed.iter().filter_map(|followed| followed.shown), self.all_known_shown)
     }

@@ -8,7 +8,7 @@
 //! | `name` | the 64-bit NAME of J1939-81 |
 //! | `id` | priorities, parameter group numbers and addresses in an extended identifier |
 //! | `trouble_code` | a code, the lamps, and the payload of DM1 and DM2 |
-//! | `codes` | limits each sent code to one change a second, without losing short activity |
+//! | `codes` | sends at most one change of each code a second; a code that was active only briefly is still sent |
 //! | `transport` | payloads of more than 8 bytes, broadcast in packets (BAM) |
 //! | `address` | claiming the address, defending it, falling silent |
 //! | `event` | events of the node |

@@ -1,4 +1,5 @@
-//! The J1939 node: claims its address, sends DM1 once a second and on every change, and answers requests.
+//! The J1939 node: claims its address, sends trouble codes (DM1: active codes; DM2: previously active codes), and
+//! answers requests.
 //!
 //! * DM1 is sent once a second, even without codes, and at once on a change. The module `codes` limits how often one
 //!   code changes.
@@ -162,7 +163,7 @@ impl Node {
         let &[low, middle, high, ..] = frame.data() else { return };
         let is_for_all = header.destination == GLOBAL_ADDRESS;
         let answer = match (pgn_of([low, middle, high]), self.claim.state) {
-            // After a loss, another node has the address. Then only requests to all nodes concern this node.
+            // If the address was lost, another node has it. Then only requests to all nodes concern this node.
             (PGN_ADDRESS_CLAIMED, ClaimState::Lost) if !is_for_all => return,
             (PGN_ADDRESS_CLAIMED, ClaimState::Idle | ClaimState::Claiming | ClaimState::Claimed | ClaimState::Lost) => {
                 return self.claim.handle_request(now);
@@ -205,7 +206,7 @@ impl Node {
         let Some(transfer) = &mut self.transfer else { return };
         out.frames.extend(transfer.poll(now, self.address));
         if transfer.is_complete() {
-            // The next announcement must keep the packet spacing, too.
+            // The announcement of the next transfer must keep the packet spacing, too.
             self.transport_free_at = transfer.due;
             self.last_transferred = transfer.pgn;
             if transfer.pgn == PGN_DM1 {
@@ -222,7 +223,8 @@ impl Node {
         }
     }
 
-    /// Makes the cyclic DM1 due, unless a DM1 was sent less than a period ago.
+    /// Resumes the cyclic DM1, which was skipped since `skipped_since`. It is due now, or one period after
+    /// `skipped_since` if that is later.
     pub(crate) fn resume_cyclic(&mut self, now: Timestamp, skipped_since: Timestamp) {
         let earliest = skipped_since.plus_nanos(DM1_PERIOD_NS).max(now);
         self.next_dm1 = self.next_dm1.min(earliest);
@@ -312,8 +314,8 @@ impl Node {
         }
     }
 
-    /// Time of the next [`poll`](Self::poll), which may be in the past. `None` = only after a frame or
-    /// [`start`](Self::start). An earlier poll does nothing.
+    /// Time of the next [`poll`](Self::poll), which may be in the past. `None` = not before a frame arrives or
+    /// [`start`](Self::start) is called. An earlier poll does nothing.
     pub fn next_due(&self) -> Option<Timestamp> {
         let claim = self.claim.next_due();
         if self.is_silent() {

@@ -1,7 +1,7 @@
 //! Broadcasts a payload of more than 8 bytes in packets (BAM of J1939-21): an announcement, then 7 bytes per packet.
 //!
-//! The standard requires 50 to 200 ms between packets. Each frame is due 50 ms after the previous frame, so that a late
-//! poll does not shorten the spacing.
+//! The standard requires 50 to 200 ms between packets. Each frame is due 50 ms after the previous frame was sent. If a
+//! frame is sent late, because the caller polls late, the next frame is therefore not sent too soon.
 
 use serde::{Deserialize, Serialize};
 

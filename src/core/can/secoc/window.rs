@@ -1,4 +1,5 @@
-//! Decides which freshness values a command may have.
+//! Decides which freshness values a command may have. A freshness value is the counter of an authenticated command; it
+//! prevents replays.
 //!
 //! The receiver announces a value once a second, each time [`ANNOUNCEMENT_STEP`] higher. A command carries the
 //! announced value, or a higher value below the next announcement. The sender uses each value once and in rising order.
@@ -60,8 +61,8 @@ impl FreshnessWindow {
         self.announced.saturating_sub(ANNOUNCEMENT_STEP).max(self.accepted.saturating_add(1))
     }
 
-    /// The values that a payload's freshness may represent. Empty if the freshness is expired or the payload is too
-    /// short.
+    /// A payload contains only the low bits of its freshness value. Returns the acceptable values with these bits.
+    /// Empty if the freshness value has expired or the payload is too short.
     pub fn check(&self, authentication: Authentication, payload: &[u8]) -> MacCheck {
         let mut candidates = [None; MAX_CANDIDATES];
         if let Some(sent) = authentication.sent_freshness(payload) {

@@ -1,4 +1,5 @@
-//! Tests that the offsets of aged curves agree with the electrodes, are continuous, and keep the curves rising.
+//! An aged open-circuit curve is the new cell's curve plus an offset. Tests that the offsets agree with the model of
+//! the electrodes, are continuous, and keep the curves rising.
 
 use super::*;
 use crate::cell::electrodes::tests::{LFP, M50};
@@ -24,7 +25,8 @@ fn new_cell_has_no_offset() {
     for s in 0..5 {
         assert!(offset_v(&m50(), s, 5.0).abs() < 1e-12, "{s}");
         assert_eq!(m50().line(&SOC, s, 5.0).mixes_v, [SocLine::default(); MIXES]);
-        // The curve changes smoothly around the new capacity and is constant above 105 %.
+        // 5 % above and 5 % below the new cell's capacity of 5 Ah, the offsets are opposite. Above 105 %, the offset is
+        // constant.
         assert!((offset_v(&m50(), s, 5.25) + offset_v(&m50(), s, 4.75)).abs() < 1e-12, "{s}");
         assert_eq!(offset_v(&m50(), s, 5.3), offset_v(&m50(), s, 9.0));
     }
@@ -45,7 +47,8 @@ fn offsets_match_aged_curves_and_are_continuous() {
         let (least, edge) = (offset_v(&table, s, 0.5), offset_v(&table, s, 2.0));
         assert!((least - edge).abs() < 1e-9, "constant below the lowest capacity: {least} {edge}");
     }
-    // The mix is half of the difference between two offsets: with the shares 0.6 and 0 of lost negative material.
+    // The first mix is the change of the offset by one standard deviation of the share of lost negative material (0.3
+    // +/- 0.3). It is half of the difference between the offsets at the shares 0.6 and 0.
     let with =
         |negative: f64| M50.aged(LostMaterial { negative: negative * 0.2, positive: 0.3 * 0.2 }, 0.8).expect("a cell");
     let expected_v = 0.5 * (with(0.6).voltage_v(SOC[2]) - with(0.0).voltage_v(SOC[2]));
@@ -59,11 +62,12 @@ fn offsets_match_aged_curves_and_are_continuous() {
 #[test]
 fn shift_keeps_both_ends() {
     let table = AgedOcv::of_shift(0.8, &SOC, 2.0, &rows(|z| 3.0 + z));
-    // A quarter of the capacity is lost: a = 0.8 x 0.25 = 0.2.
+    // A quarter of the capacity is lost, so the SOC s is shifted by 0.8 x 0.25 s (1 - s). The curve has a slope of 1 V
+    // per unit of SOC.
     assert!((offset_v(&table, 2, 1.5) - 0.2 * 0.4 * 0.6).abs() < 1e-12);
     assert_eq!(offset_v(&table, 0, 1.5), 0.0);
     assert!(table.line(&SOC, 4, 1.5).offset_v.at(1.0).abs() < 1e-12);
-    // The shift's standard deviation of 0.3 moves the curve by 0.3 x 0.25 s (1 - s).
+    // One standard deviation of the shift (0.3) moves the curve by 0.3 x 0.25 s (1 - s).
     let mix_v = |table: &AgedOcv| table.line(&SOC, 2, 1.5).mixes_v[0].at(SOC[2]);
     assert!((mix_v(&table) - 0.075 * 0.4 * 0.6).abs() < 1e-12);
     let (mut other, mut electrodes) = (table.clone(), m50());

@@ -102,7 +102,8 @@ struct PossibleCell {
 }
 
 impl CurvePrior {
-    /// Computes curves of all pairs of materials. Returns `None` if no pair gives a cell between the voltages.
+    /// Computes the curves of all pairs of materials. Returns `None` if no pair gives a cell with these cut-off
+    /// voltages.
     pub fn new(cell_type: &CellType<'_>, soc: &[f64]) -> Option<Self> {
         let CellType { positives, negatives, empty_v, full_v, hysteresis_v } = *cell_type;
         let pairs = positives.iter().flat_map(|p| negatives.iter().map(move |&n| (p, n)));
@@ -147,13 +148,14 @@ impl CurvePrior {
         Some(Self { soc: soc.to_vec(), mean_v, covariance, electrodes })
     }
 
-    /// Independent modes of the differences between cells (V per standard deviation), and the standard deviation of the
-    /// remaining differences (V). The first modes have the largest effect on the SOC that a voltage reading gives.
+    /// Splits the differences between cells into independent shapes (modes). Returns the modes that have the largest
+    /// effect on an SOC computed from a voltage. Each mode is the change of the curve for one standard deviation (V).
+    /// Also returns the standard deviation of the differences that these modes do not explain (V).
     pub fn modes_v(&self) -> ([Vec<f64>; MIXES], Vec<f64>) {
         let n = self.soc.len();
         let slope_v = |s: usize| {
             let (a, b) = (s.saturating_sub(1), (s + 1).min(n - 1));
-            // On a curve flatter than this limit, a voltage gives no information about the SOC.
+            // On a curve flatter than 0.1 V per unit of SOC, a voltage gives hardly any information about the SOC.
             ((self.mean_v[b] - self.mean_v[a]) / (self.soc[b] - self.soc[a])).max(0.1)
         };
         let width = |s: usize| 0.5 * (self.soc[(s + 1).min(n - 1)] - self.soc[s.saturating_sub(1)]);
@@ -179,7 +181,8 @@ impl CurvePrior {
     }
 }
 
-/// Inverse of a curve's covariance plus a roughness of 2 mV; `None` if this sum is not positive definite.
+/// Adds an independent error of 2 mV per breakpoint to a curve's covariance and returns the inverse of the sum; `None`
+/// if the sum is not positive definite.
 pub fn information(covariance_v2: &DMatrix<f64>) -> Option<DMatrix<f64>> {
     let own = DMatrix::from_diagonal_element(covariance_v2.nrows(), covariance_v2.nrows(), 0.002 * 0.002);
     Some((covariance_v2 + own).cholesky()?.inverse())

@@ -20,7 +20,7 @@ pub(crate) const LFP: Electrodes = Electrodes {
 
 #[test]
 fn materials_fall_with_their_lithium_content() {
-    // Functions that were fitted to measurements rise by a few millivolts at some points.
+    // Some potential functions were fitted to measurements. They rise by a few millivolts at some points.
     let falls = |potential_v: &dyn Fn(f64) -> f64| {
         (1..=98).all(|k| potential_v(0.01 * f64::from(k)) > potential_v(0.01 * f64::from(k + 1)) - 0.004)
     };

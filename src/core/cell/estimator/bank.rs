@@ -3,10 +3,11 @@
 //! In: one [`CellStep`] per cell and batch (V, A, s, degrees C). Out: a [`StepResult`] and estimates per cell.
 //!
 //! Almost every step is ordinary: the current was measured for the whole time since the last voltage, and the voltage
-//! is within the gate. The [`kernel`] computes ordinary steps for [`WIDTH`] cells at a time, with one cell per vector
-//! lane. With the feature `wide`, the bank uses the machine's widest vector instructions. Without such instructions, it
-//! steps the cells one by one. All other steps use parts of the same kernel with one lane ([`SingleCell`]). Examples
-//! are a first voltage, a gap, an unknown current, and a reading beyond the gate.
+//! is within the gate, which means close enough to the predicted voltage. The [`kernel`] computes ordinary steps for
+//! [`WIDTH`] cells at a time, with one cell per vector lane. With the feature `wide`, the bank uses the machine's
+//! widest vector instructions. Without such instructions, it steps the cells one by one. All other steps use parts of
+//! the same kernel with one lane ([`SingleCell`]). Examples are a first voltage, a gap, an unknown current, and a
+//! reading beyond the gate.
 //!
 //! A cell's estimates do not depend on the other cells of the pack. Whether a step is ordinary depends only on the cell
 //! itself, and the bits of a lane do not depend on other lanes.
@@ -44,7 +45,7 @@ pub struct EstimatorBank {
     plausible_ah: (f64, f64),
     filters: FilterArrays,
     cells: Vec<CellSlot>,
-    /// If a cell is not in the batch, its input is old, and the result is discarded.
+    /// If a cell is not in the batch, its input comes from an earlier batch, and the result is discarded.
     inputs: Vec<BlockInput>,
     results: Vec<StepResult>,
     others: Vec<(usize, CellStep)>,
@@ -175,7 +176,8 @@ impl EstimatorBank {
         self.cells[cell].has_filter
     }
 
-    /// State of charge in the filter, without limits and without the uncertainty of downtime.
+    /// State of charge as the filter holds it: not limited to 0 to 1, and without the additional uncertainty after
+    /// downtime.
     pub fn filtered_soc(&self, cell: usize) -> Option<ScalarGaussian> {
         self.is_started(cell).then(|| self.marginal(cell, 0))
     }
@@ -215,7 +217,8 @@ impl EstimatorBank {
         self.cell(cell).branch_v()
     }
 
-    /// Mean normalised innovation squared over the consistency window: about 1 or less for a consistent filter.
+    /// Mean normalised innovation squared over a configured time (`consistency_window_s`): about 1 or less for a
+    /// consistent filter.
     #[inline]
     pub fn mean_nis(&self, cell: usize) -> f64 {
         let (block, lane) = (cell / WIDTH, cell % WIDTH);
@@ -313,7 +316,8 @@ impl EstimatorBank {
         self.set_current_offset_std(offset_std_a);
     }
 
-    /// Corrects the ratio of every cell's slowest branch by the evidence since the last correction.
+    /// Learns the slow ratio of every cell (how much more the resistance of its slowest branch has changed than the
+    /// other resistances) from the evidence since the last correction.
     pub fn learn_slow_branches(&mut self) {
         let config = self.config;
         self.change_all(|cell| cell.learn_slow_branch(&config));

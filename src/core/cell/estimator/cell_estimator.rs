@@ -1,9 +1,11 @@
-//! The estimator of one cell outside its bank: steps that are not ordinary ([`super::bank`]), restarts, learning and
-//! estimates.
+//! The estimator of one cell. [`super::bank`] steps many cells at once, if their steps are ordinary: the current was
+//! measured since the last voltage, and the voltage is within the gate. This module computes all other steps of a cell,
+//! its restarts, its learning and its estimates.
 //!
-//! In: one [`CellStep`] per voltage reading. Out: a [`StepResult`], and estimates with their variances. A reading
-//! beyond the gate does not correct the state. If a step cannot be computed, the filter restarts. Constant errors are
-//! errors that do not change with time, such as the offset of a sensor.
+//! In: one [`CellStep`] per voltage reading. Out: a [`StepResult`], and estimates with their variances. The gate is a
+//! bound on measured minus predicted voltage. A reading beyond the gate does not correct the state. If a step cannot be
+//! computed, the filter restarts. Constant errors are errors that do not change with time, such as the offset of a
+//! sensor.
 
 use nalgebra::SMatrix;
 
@@ -22,8 +24,9 @@ use crate::cell::{CellModel, EstimatorConfig, MAX_BRANCHES, SensorErrors};
 use crate::filter::ScalarGaussian;
 use crate::quantity::bounds;
 
-/// A change of the SOC over a gap is called a jump if the counted charge does not explain it. The unexplained part must
-/// exceed this fraction and [`JUMP_SIGMA`] standard deviations of the SOC before the step.
+/// A gap is a time without a measured current. The SOC has jumped over a gap if it changed by more than the counted
+/// charge explains. The unexplained part must exceed both this fraction and [`JUMP_SIGMA`] standard deviations of the
+/// SOC before the step.
 const JUMP: f64 = 0.05;
 const JUMP_SIGMA: f64 = 4.0;
 
@@ -38,8 +41,8 @@ pub struct AdoptedState {
     pub capacity: ScalarGaussian,
     /// ln of the resistance relative to the model.
     pub log_resistance: f64,
-    /// Current (A) after first-order low-pass filters with the time constants of the branches; `None` = the branches
-    /// have relaxed.
+    /// For each RC branch, the current (A) after a first-order low-pass filter with the time constant of the branch;
+    /// `None` = the branches have relaxed.
     pub filtered_a: Option<[f64; MAX_BRANCHES]>,
 }
 
@@ -56,8 +59,8 @@ impl CellEstimator {
         Self { filter: None, memory: Memory::new(config) }
     }
 
-    /// Computes a step that is not ordinary: a prediction over the time since the last reading, then an update with the
-    /// voltage.
+    /// Computes a step that is not ordinary (see the head of this file): a prediction over the time since the last
+    /// reading, then an update with the voltage.
     pub(super) fn rare_step(
         &mut self,
         mut kernel: SingleCell,
@@ -148,7 +151,8 @@ impl CellEstimator {
             let load_v =
                 model.r0_ohm(&guess) * libm::exp(self.memory.log_resistance.mean) * step.current_a.unwrap_or(0.0);
             let temperature = model.temperature_position(temperature_c);
-            // Near the end of a flat curve, a small voltage error would give any SOC, so the SOC is limited.
+            // Where the OCV curve is flat at its end, a small voltage error can give an SOC far outside 0 to 1. The SOC
+            // is therefore limited.
             model.soc_of_aged_ocv(&temperature, self.memory.curve.mean, step.voltage_v + load_v).clamp(-0.05, 1.05)
         });
         let soc = ScalarGaussian { mean: soc, variance: square(config.initial.soc_std).max(KNOWN_VARIANCE) };
@@ -171,8 +175,8 @@ impl CellEstimator {
         self.memory.is_soc_unknown = false;
     }
 
-    /// Continues with another `model` from `state`, which was determined with this model. The estimates of the old
-    /// model are discarded.
+    /// Continues with the new `model` from `state`, which was determined with the new model. The estimates that were
+    /// made with the old model are discarded.
     pub fn adopt(&mut self, model: &CellModel, config: &EstimatorConfig, state: &AdoptedState) {
         let temperature_c = self.memory.temperature_c;
         self.memory.capacity = state.capacity;
@@ -209,8 +213,8 @@ impl CellEstimator {
         self.filter = Some(x);
     }
 
-    /// Variance of each branch's voltage at a start (V^2). If the cell is under load, a usual load of unknown duration
-    /// may have charged the branches.
+    /// Variance of each branch's voltage when the filter starts (V^2). If the cell is under load at the start, this
+    /// load may already have charged the branches for an unknown time.
     fn first_branch_variance(
         &self,
         model: &CellModel,
@@ -221,7 +225,7 @@ impl CellEstimator {
         let position = model.grid_position(soc, self.memory.temperature_c.unwrap_or(step.ambient_c));
         let ratio = libm::exp(self.memory.log_resistance.mean);
         let is_loaded = step.current_a.is_some_and(|current_a| current_a.abs() > config.gap.rest_current_a);
-        // C/2 counts as the usual load.
+        // A load of C/2 is assumed.
         let load_a = if is_loaded { 0.5 * model.rated_capacity_ah } else { 0.0 };
         let mut variance = [square(config.initial.branch_std_v).max(KNOWN_VARIANCE); MAX_BRANCHES];
         for (i, variance) in variance.iter_mut().enumerate().take(model.branches.len()) {
@@ -282,15 +286,15 @@ impl CellEstimator {
         self.filter.as_ref().map_or_else(SMatrix::zeros, rows)
     }
 
-    /// Corrects the state by `deviations` standard deviations of the current sensor's offset. The standard deviation of
-    /// the offset is multiplied by `remains`.
+    /// Corrects the state after the current sensor's offset was found to differ from its assumed value by `deviations`
+    /// standard deviations. Multiplies the standard deviation of the offset by `remains`.
     pub fn absorb_current_offset(&mut self, deviations: f64, remains: f64) {
         (self.memory.offset_information, self.memory.offset_score) = (0.0, 0.0);
         self.absorb(CURRENT_OFFSET, deviations, remains);
     }
 
-    /// If the cell has several branches, corrects the ratio of the slowest branch by the evidence since the last
-    /// correction; otherwise, discards the evidence.
+    /// If the cell has several branches, corrects the resistance ratio of the slowest branch with the evidence since
+    /// the last correction. If the cell has one branch, discards the evidence.
     pub fn learn_slow_branch(&mut self, config: &EstimatorConfig) {
         if self.filter.as_ref().is_none_or(|x| x.states == BRANCHES + 1) {
             (self.memory.slow_branch.information, self.memory.slow_branch.score) = (0.0, 0.0);
@@ -323,7 +327,7 @@ impl CellEstimator {
         }
     }
 
-    /// Covariance of capacity (Ah) and ln(resistance), without the constant errors.
+    /// Covariance of capacity (Ah) and ln(resistance). The part that constant errors cause is not included.
     pub fn capacity_resistance_covariance(&self) -> f64 {
         self.filter.as_ref().map_or(0.0, |x| x.covariance[(LOG_RESISTANCE, CAPACITY)])
     }
@@ -333,19 +337,21 @@ impl CellEstimator {
         self.memory.curve
     }
 
-    /// Derivative of the capacity estimate with respect to the capacity of the open-circuit curve, since the last call
-    /// of [`Self::restate_capacity`].
+    /// Derivative of the capacity estimate with respect to the capacity that selects the open-circuit curve. Only the
+    /// readings since the last call of [`Self::restate_capacity`] contribute to it.
     pub fn capacity_by_curve(&self) -> f64 {
         let std_ah = self.memory.curve.std();
         let by_curve = |x: f64| if std_ah > 0.0 { -x / std_ah } else { 0.0 };
         self.filter.as_ref().map_or(0.0, |x| by_curve(x.by_constant[(CAPACITY, CURVE_CAPACITY)]))
     }
 
-    /// Replaces the capacity estimate and the capacity of the open-circuit curve by `capacity`. The caller does this at
-    /// the end of a charge or discharge, and when the learned capacity is replaced or doubted. The state is corrected
-    /// as if the new curve had been used since the last call.
+    /// Replaces the capacity estimate and the capacity that selects the open-circuit curve by `capacity`. The caller
+    /// does this at the end of a charge or discharge, and when another value replaces the learned capacity or the
+    /// learned capacity is no longer trusted. The state is corrected as if the new curve had been used since the last
+    /// call.
     ///
-    /// The variance of the filter does not fall, because the evidence since the last call may have had too much weight.
+    /// The filter's variance of the capacity is never reduced, because the evidence since the last call may have had
+    /// too much weight.
     pub fn restate_capacity(&mut self, capacity: ScalarGaussian) {
         self.memory.capacity = capacity;
         let before = self.memory.curve;
@@ -378,7 +384,7 @@ impl CellEstimator {
         }
     }
 
-    /// Handles a sleep: until a voltage has been used, the SOC counts as carried over.
+    /// Handles a sleep: until the next voltage is used, the SOC is marked as carried over from before the sleep.
     pub fn note_sleep(&mut self) {
         self.memory.is_unseen = self.filter.is_some();
     }

@@ -7,21 +7,22 @@
 //! Deviation 6 (see [`super`]): a downtime is described by two hypotheses.
 //! * The cell rested. This is usually more likely. The SOC has only fallen by the self-discharge, and all correlations
 //!   still hold.
-//! * The cell was used or charged. The SOC can be anywhere within reach in that time, and the branches are as uncertain
-//!   as at a start.
+//! * The cell was used or charged. Every SOC that the cell can have reached in that time is possible, and the voltages
+//!   of the RC branches are as uncertain as at a start.
 //!
 //! The first voltage with a known current updates both hypotheses. They are weighted by their likelihoods (Bayes' rule,
 //! prior in [`Memory`]) and merged into one Gaussian with their common mean and covariance. Until then, the standard
 //! deviation of the second hypothesis is published.
 //!
-//! Effect: after a night without use, the counted charge stays accurate, and the rest voltage keeps its information
-//! about the capacity. Use that was not measured is found at the first reading. A single narrow Gaussian would need
-//! hours for this, and a single wide Gaussian would lose the counted charge.
+//! Effect: after a night without use, the counted charge stays accurate, and the voltage at rest still gives
+//! information about the capacity. If the cell was used meanwhile, the first reading shows it. With one hypothesis, a
+//! narrow Gaussian would need hours to find the use, and a wide Gaussian would lose the counted charge.
 //!
-//! A gap (sleep, a hole in a log) is described in the same way. A load before or after the gap continued or ended
-//! during the gap, with equal probability. If the cell rested before and after the gap, a charger may have been
-//! connected. This is rare, because a bus in use wakes its listeners. It is more likely in a longer gap. Without the
-//! second hypothesis, charge that was not recorded would be learned as a change of capacity.
+//! A gap (sleep, a hole in a log) is described in the same way. If a load flowed before or after the gap, it continued
+//! during the gap with a probability of one half. If the cell rested before and after the gap, a charger may have been
+//! connected in the gap. A charger is unlikely, because it would use the bus and so wake the daemon. In a longer gap,
+//! it is more likely. Without the second hypothesis, charge that was not recorded would be learned as a change of
+//! capacity.
 //!
 //! [`Memory`]: super::memory::Memory
 
@@ -33,8 +34,8 @@ use super::step::{CellStep, Update};
 use super::voltage_reach::{FAR, FLAT};
 use crate::cell::{CellModel, EstimatorConfig};
 
-/// Updates with the first reading after a downtime. This reading is not evidence about the sensor's offset or the
-/// slowest branch.
+/// Updates the filter with the first reading after a downtime. This reading does not count as evidence about the
+/// current sensor's offset or the slowest RC branch.
 pub(super) fn update_after_downtime(
     kernel: &mut SingleCell,
     (x, memory): (&mut Gaussian, &Memory),
@@ -56,12 +57,12 @@ pub(super) fn update_after_downtime(
         branch_variance += used.covariance[(i, i)];
         drop_v += if i + 1 < used.states { used.mean[i] } else { memory.slow_branch.ratio * used.mean[i] };
     }
-    // Only the weights of the hypotheses use this wide prior; its updated copy is discarded.
+    // This wide prior serves only to compute the weights of the hypotheses; its updated copy is discarded.
     let wide = update(&mut used.clone())?;
     let reach = 3.0_f64.sqrt() * memory.downtime_std;
     let soc = model.soc_of_aged_ocv(&temperature, memory.curve.mean, step.voltage_v + drop_v);
-    // All SOCs within reach are equally likely. The prior is centred at the SOC that the voltage gives, so that the
-    // update linearises the curve there.
+    // All SOCs within `reach` are equally likely, so the mean may be moved. It is moved to the SOC that the voltage
+    // gives, because the update linearises the curve at the mean.
     let within_reach = |soc: f64| soc.clamp(before_soc - reach, before_soc + reach);
     used.mean[0] = within_reach(soc);
     let by_used = update(&mut used)?;
@@ -87,8 +88,8 @@ pub(super) fn update_after_downtime(
     Some(if weight > 0.5 { by_used } else { by_left_alone })
 }
 
-/// Prior of the second hypothesis: the SOC is anywhere within reach and uncorrelated, and the branches are as uncertain
-/// as at a start.
+/// Prior of the second hypothesis: the SOC is widened by the possible use and has no correlations, and the branches are
+/// as uncertain as at a start.
 fn used_prior(x: &Gaussian, config: &EstimatorConfig, downtime_std: f64) -> Gaussian {
     let mut used = *x;
     used.covariance[(0, 0)] = widened(x.marginal(0).variance, square(downtime_std));

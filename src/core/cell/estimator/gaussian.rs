@@ -1,7 +1,7 @@
 //! Mean and covariance of one cell's state, for any number of branches.
 //!
-//! Values have the units of the states. Inputs are not checked. A constant error does not change with time, for example
-//! the offset of a sensor.
+//! Values have the units of the states. Inputs are not checked. rho is the cell's resistance relative to the model. A
+//! *constant error* is an error that does not change with time, for example the offset of a sensor.
 
 use nalgebra::{SMatrix, SVector};
 
@@ -84,14 +84,15 @@ impl Gaussian {
         if remains <= 1.0 {
             self.by_constant.set_column(constant_error, &(column * remains));
         } else {
-            // The error grows. The added part is new, so it has not moved any state.
+            // The constant error has grown. The states do not depend on its new part, so a smaller share of their
+            // errors comes from this constant error. The other share moves to `covariance`.
             self.by_constant.set_column(constant_error, &(column / remains));
             self.covariance += column * column.transpose() * (1.0 - 1.0 / square(remains));
         }
     }
 
-    /// Raises the uncertainty after a gap of unknown length. The SOC is unknown, and the branches are between loaded
-    /// and relaxed.
+    /// Raises the uncertainty after a gap of unknown length. The SOC is unknown. Each branch voltage is between its old
+    /// value and 0, because the branch may have relaxed.
     pub(super) fn widen_after_unknown_gap(&mut self) {
         self.covariance[(0, 0)] = widened(self.covariance[(0, 0)], UNKNOWN_SOC_VARIANCE);
         for i in BRANCHES..self.states {

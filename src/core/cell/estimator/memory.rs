@@ -1,8 +1,9 @@
-//! The estimator's memory: rest, load, consistency, rejected readings, and the estimates that a restart of the filter
-//! keeps.
+//! State of the cell estimator outside its Kalman filter: duration of rest, recent load, consistency of the readings,
+//! rejected readings, and the estimates that are kept when the filter restarts.
 //!
-//! In: steps (A, s) and the outcomes of updates. Out: the time that a reading represents (s), the load (A), and whether
-//! the filter must restart.
+//! In: steps (current in A, duration in s) and the results of the filter's updates. Out: the time that a reading
+//! represents (s), the load (A), and whether the filter must restart. A gap is a time without a measured current.
+//! Downtime is such a time during which the cell may have been used.
 
 use serde::{Deserialize, Serialize};
 
@@ -15,35 +16,39 @@ use crate::filter::{Measurement, ScalarGaussian};
 use crate::quantity::InvalidState;
 use crate::quantity::bounds::{self, Bounds};
 
-/// If a load flows before or after a gap, at least this load is assumed during the gap: 1 C.
+/// If a load current flows before or after a gap, a load of at least 1 C (the rated capacity in one hour) is assumed
+/// during the gap.
 const GAP_LOAD_PER_H: f64 = 1.0;
 
 /// Prior probability that a cell was used while the program did not run.
 pub(super) const USED_PRIOR: f64 = 0.2;
 
-/// Prior probability of use in a gap with a load before or after it. The load continued or ended with equal
-/// probability.
+/// Prior probability that a cell was used during a gap, if a load current flowed before or after the gap. It is equally
+/// likely that the load continued and that it ended.
 const LOADED_PRIOR: f64 = 0.5;
 
-/// Prior probability that a charger worked in a gap of at least half a day with rest before and after it. This is rare,
-/// because a bus in use wakes its listeners.
+/// Prior probability that the cell was charged during a gap, if the gap lasted at least half a day and the cell rested
+/// before and after it. Such a charge is rare, because charging causes bus traffic, which wakes the computer of
+/// packwatch.
 const CHARGER_PRIOR: f64 = 0.05;
 
-/// A downtime is negligible if its SOC change has at most this standard deviation (fraction).
+/// A downtime is negligible if the standard deviation of the SOC change during the downtime is at most this value
+/// (fraction).
 const NEGLIGIBLE_STD: f64 = 0.002;
 
 /// State of the estimator in addition to its filter.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Memory {
-    /// Capacity (Ah) before the first voltage and across a restart.
+    /// Capacity (Ah) that is used until the filter has its first voltage, and that is kept while the filter restarts.
     pub(super) capacity: ScalarGaussian,
     /// Capacity that selects the open-circuit curve of the aged cell (Ah).
     pub(super) curve: ScalarGaussian,
     pub(super) log_resistance: ScalarGaussian,
     pub(super) temperature_c: Option<f64>,
     pub(super) last_current_a: f64,
-    /// Low-pass of |current| (A) with the time constant `load_memory_s`: the load that still drives slow diffusion.
+    /// |current| (A) after a low-pass filter with the time constant `load_memory_s`: the load that still drives slow
+    /// diffusion.
     pub(super) load_a: f64,
     /// Mean normalised innovation squared over the consistency window.
     pub(super) mean_nis: f64,
@@ -132,9 +137,9 @@ impl Memory {
         soc
     }
 
-    /// Determines the SOC from the voltage of a step without a known current. The largest possible current is the last
-    /// known current, but at least [`GAP_LOAD_PER_H`]. Every smaller current is equally likely in both directions.
-    /// `log_resistance`: ln of the resistance relative to a new cell.
+    /// Determines the SOC from the voltage of a step without a known current. The unknown current is at most the last
+    /// known current, or [`GAP_LOAD_PER_H`] if that is larger. All currents up to this limit, in both directions, are
+    /// equally likely. `log_resistance`: ln of the resistance relative to a new cell.
     pub(super) fn note_voltage(
         &mut self,
         model: &CellModel,
@@ -176,8 +181,9 @@ impl Memory {
         }
         let load_per_s = if is_loaded { adjacent_a / (3600.0 * capacity_ah) } else { 0.0 };
         let away_per_s = config.gap.away_use_per_s;
-        // While the cell reports its voltage, it is awake, so use may start at any time. In a silent gap shorter than
-        // an hour, slow relaxation would be mistaken for a charger.
+        // If only the current is missing and the cell still reports its voltage, the cell may be used at any time. In a
+        // gap shorter than an hour without any reading, no use is assumed, because slow relaxation of the voltage would
+        // be mistaken for a charge.
         let use_per_s = if continues || unnoted_s >= 3600.0 { away_per_s } else { 0.0 };
         let most = load_per_s.max(use_per_s) * step.unmeasured_s - away_per_s * noted_s;
         if most <= 0.0 {
@@ -190,8 +196,8 @@ impl Memory {
         let used_at_rest = CHARGER_PRIOR * (unnoted_s / 43_200.0).min(1.0);
         let used = if is_loaded { LOADED_PRIOR } else { used_at_rest };
         if continues {
-            // One unknown current flows through the whole stretch. Its charge grows linearly, and the stretch counts as
-            // one gap.
+            // Consecutive steps without a known current count as one gap with one constant unknown current, so the
+            // standard deviation of the SOC change grows linearly.
             self.downtime_std = (self.downtime_std + std).min(1.0);
             self.used_prior = self.used_prior.max(used.max(USED_PRIOR));
         } else {
@@ -225,7 +231,7 @@ impl Memory {
         (self.downtime_std > NEGLIGIBLE_STD).then_some(self.downtime_std)
     }
 
-    /// Ends the downtime hypotheses, because a voltage has decided between them.
+    /// Ends the uncertainty about the downtime, because a voltage has shown whether the cell was used.
     #[inline]
     pub(super) fn end_downtime(&mut self) {
         (self.downtime_std, self.used_prior, self.noted_s, self.is_unseen) = (0.0, 0.0, 0.0, false);
@@ -259,7 +265,8 @@ impl Memory {
         }
     }
 
-    /// Whether the filter must restart, because too many consecutive readings were beyond the gate.
+    /// Whether the filter must restart, because too many consecutive readings were rejected (their innovations were
+    /// beyond the gate).
     #[inline]
     pub(super) fn has_lost_cell(&self, config: &EstimatorConfig) -> bool {
         // One or two readings can be outliers.

@@ -20,7 +20,7 @@ pub struct CellModule {
     pub model: CellModel,
     /// The pack's estimator settings with the initial capacity of this model.
     pub estimator: EstimatorConfig,
-    /// Whether the model comes from a file; otherwise, it comes from the label.
+    /// Whether the model comes from a file; otherwise, it is built from the label (chemistry and rated capacity).
     pub is_given: bool,
 }
 

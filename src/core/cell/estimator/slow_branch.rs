@@ -1,8 +1,8 @@
-//! Learns a resistance ratio for the slowest branch of each cell, in addition to the resistance ratio of the whole
+//! Learns a resistance ratio for the slowest RC branch of each cell, in addition to the resistance ratio of the whole
 //! cell.
 //!
-//! In: evidence from innovations. Out: the ratio and its standard deviation. If a model has a single branch, this
-//! branch covers all time constants, so its ratio stays 1.
+//! In: evidence from innovations (measured minus predicted voltages). Out: the ratio and its standard deviation. If a
+//! model has a single branch, this branch covers all time constants, so its ratio stays 1.
 //!
 //! Reason: diffusion and electrolyte determine the slowest branch. They vary between cells, and they age differently
 //! from contacts and charge transfer. The state [`LOG_RESISTANCE`](super::state_vector::LOG_RESISTANCE) mostly follows
@@ -29,8 +29,8 @@ const RANGE: (f64, f64) = (0.05, 3.0);
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct SlowBranch {
-    /// Voltage of the cell's slowest branch, divided by its voltage according to the model and the cell's resistance
-    /// ratio.
+    /// Actual voltage of the cell's slowest branch, divided by the voltage that follows from the model and the cell's
+    /// resistance ratio.
     pub(super) ratio: f64,
     /// Standard deviation of the ratio, relative to the configured standard deviation.
     pub(super) part: f64,

@@ -41,10 +41,11 @@ pub struct Update {
 /// Outcome of a step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StepResult {
-    /// The update with the voltage; `None` without a known current, or if the step could not be computed.
+    /// The update with the voltage; `None` if the current is unknown, or if the step could not be computed.
     pub update: Option<Update>,
     /// Whether the filter was restarted from the voltage.
     pub reset: bool,
-    /// Whether the SOC has changed over a gap by far more than counted charge and earlier uncertainty explain.
+    /// Whether the SOC after a gap differs from the SOC before the gap by far more than the counted charge and the
+    /// uncertainty before the gap explain.
     pub jumped: bool,
 }

@@ -8,12 +8,13 @@
 //! 1 %, but an error of four standard deviations moves it by 25 %. The reach is therefore measured at [`FAR`] standard
 //! deviations and divided by [`FAR`].
 //!
-//! The filter may have found the SOC at the steep end and then counted charge. The reach of SOCs up to [`NEAR`]
-//! intervals away therefore counts, too, if a flat part of the curve is within reach there.
+//! The filter may have found the SOC from the voltage at another SOC, and then counted charge up to the present SOC.
+//! Therefore, the reach at SOCs up to [`NEAR`] grid intervals away counts, too, if a flat part of the curve is within
+//! reach of these SOCs.
 //!
-//! If a reading near a flat part contradicts the estimate, the reach extends to the SOC that this reading shows with a
-//! further error of [`FAR`] standard deviations. Reason: a filter with a small variance corrects the contradiction only
-//! slowly.
+//! If a reading near a flat part contradicts the estimate, the reading is assumed to have an additional error of
+//! [`FAR`] standard deviations. The reach then extends to the SOC that follows from this assumption. Reason: a filter
+//! with a small variance corrects the contradiction only slowly.
 
 use crate::cell::CellModel;
 use crate::cell::model::TemperaturePosition;
@@ -23,7 +24,7 @@ pub(super) const FAR: f64 = 4.0;
 
 const INTERVALS: usize = 100;
 
-/// Number of grid intervals up to which the reach of another SOC counts.
+/// Maximum distance (grid intervals) of another SOC whose reach counts.
 const NEAR: usize = 20;
 
 /// A flat part of the curve is within reach if a voltage error moves the SOC more than this many times as far as the
@@ -37,8 +38,9 @@ const LEAST_SLOPE_V: f64 = 1e-3;
 const TEMPERATURE_C: f64 = 25.0;
 
 /// Standard deviation (fraction) of a SOC that was found from a voltage. `soc`: the SOC. `error_v`: standard deviation
-/// of the voltage (V). `capacity_ah`: capacity that selects the curve (Ah). On a flat part of the curve, the slope at
-/// one SOC is not enough, so the reach of [`FAR`] standard deviations counts, too.
+/// of the voltage (V). `capacity_ah`: capacity that selects the curve (Ah). Near a flat part of the curve, the slope at
+/// this SOC is not enough. The result is therefore at least the SOC change caused by [`FAR`] standard deviations,
+/// divided by [`FAR`].
 pub fn reach_of_error(
     model: &CellModel,
     temperature: &TemperaturePosition,
@@ -55,8 +57,9 @@ pub fn reach_of_error(
 /// Reach over a grid of SOCs.
 #[derive(Debug, Clone)]
 pub(super) struct VoltageReach {
-    /// Per SOC: the reach (fraction), and the slope of the curve divided by the voltage error (1/fraction). The second
-    /// value times the filter's linear effect is the share of the reach that counts.
+    /// Per SOC: the reach (fraction), and the slope of the curve divided by the standard deviation of the voltage error
+    /// (1/fraction). The second value times `linear` (see [`Self::std`]) is the share of the reach that counts. It is 1
+    /// if the filter has found the SOC from the voltage alone.
     nodes: Vec<(f64, f64)>,
     has_flat: bool,
     /// Open-circuit voltage per SOC (V), never falling.
@@ -90,8 +93,8 @@ impl VoltageReach {
     }
 
     /// Standard deviation of the SOC (fraction) caused by the voltage error. `linear`: change of the SOC per standard
-    /// deviation of the error, as linearised by the filter. `innovation_v`: last innovation (V). The reach counts only
-    /// as far as the filter has found the SOC from the voltage and not by counting charge.
+    /// deviation of the error, as linearised by the filter. `innovation_v`: last innovation (V). The more the filter
+    /// has relied on counted charge instead of the voltage, the smaller is the share of the reach that counts.
     #[inline]
     pub(super) fn std(&self, soc: f64, linear: f64, innovation_v: f64) -> f64 {
         let (at, linear) = (soc.clamp(0.0, 1.0) * INTERVALS as f64, linear.abs());
@@ -116,7 +119,7 @@ impl VoltageReach {
         std
     }
 
-    /// Reach from the grid position `at` for a voltage error of `error_v`.
+    /// SOC change from the grid position `at` that a voltage error of `error_v` causes, divided by [`FAR`].
     fn contradicted(&self, at: f64, error_v: f64) -> f64 {
         let left = (at as usize).min(INTERVALS - 1);
         let ocv_v = self.ocv_v[left] + (at - left as f64) * (self.ocv_v[left + 1] - self.ocv_v[left]);
@@ -165,7 +168,8 @@ mod tests {
     #[test]
     fn flat_part_near_steep_end_widens_soc() {
         let reach = VoltageReach::new(&flat_model(), 0.01, 0.0);
-        // Four standard deviations are 40 mV. From 92 %, 10 mV lead down to 90 %, 10 mV more to 10 %, and 20 mV below.
+        // Four standard deviations are 40 mV. From SOC 92 %, the first 10 mV lead down to 90 %, the next 10 mV lead
+        // down to 10 %, and the last 20 mV lead below 10 %.
         let (linear, far) = (0.01 / 0.5, (0.92 - 0.1 + 0.02 / 1.5) / FAR);
         let at_end = reach.std(0.92, linear, 0.0);
         assert!((at_end - far).abs() < 0.01, "{at_end} {far}");
@@ -180,7 +184,8 @@ mod tests {
         let (soc, linear) = (0.99, 0.004 / 3.0);
         let usual = reach.std(soc, linear, 0.0);
         assert_eq!(reach.std(soc, linear, -0.005), usual, "usual noise");
-        // The reading shows 90 %. An error of 16 mV more leads below the flat part.
+        // The reading shows SOC 90 %. An additional error of 16 mV (four standard deviations) leads below the flat
+        // part.
         let wide = reach.std(soc, linear, -0.12);
         assert!(wide > 0.2 && wide > 5.0 * usual, "{wide} {usual}");
         // If the SOC comes from counted charge, the voltage error hardly matters.

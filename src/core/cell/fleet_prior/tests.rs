@@ -1,4 +1,4 @@
-//! Tests which properties a prior takes from the label and which from the vehicles.
+//! Tests which properties a fleet prior takes from the label, and which from the models that vehicles have learned.
 
 use super::*;
 use crate::cell::Chemistry;
@@ -25,8 +25,8 @@ fn untaught() -> OwnModel {
     }
 }
 
-/// Models of vehicles whose cells are well known. The mean cell differs from the label. Around the mean cell, curve,
-/// resistance and capacity have these standard deviations (V, ln, Ah).
+/// Models of vehicles whose cells are well known. The mean cell of all vehicles differs from the label. The curves,
+/// resistances and capacities of the vehicles differ from the mean cell with the given standard deviations (V, ln, Ah).
 fn taught(count: u32, [curve_v, log_resistance, capacity_ah]: [f64; 3]) -> Vec<OwnModel> {
     let vehicle = |k: u32| {
         // Each property orders the vehicles differently. Its values are evenly spread with a variance of 1.

@@ -75,7 +75,8 @@ fn aged_voltage_agrees_with_slope_and_inverse() {
     model.aged_ocv = AgedOcv::of_shift(0.8, &model.soc, model.capacity_ah, &[vec![3.0, 3.5, 4.0]]);
     let temperature = model.temperature_position(17.0);
     let at = |soc: f64| model.aged_ocv_v(&model.grid_position_at(&temperature, soc), 1.5);
-    // The loss of a quarter of the capacity moves the middle of the curve by 0.8 x 0.25 x 0.25 of SOC.
+    // A quarter of the capacity is lost. With the shift 0.8, the middle of the curve moves by 0.8 x 0.25 x 0.25 of SOC,
+    // and its voltage by 0.05 V.
     let new_v = model.ocv_v(&model.grid_position(0.5, 17.0));
     assert!((at(0.5) - new_v - 0.05).abs() < 1e-12);
     for soc in [-0.1, 0.1, 0.45, 0.7, 1.05] {

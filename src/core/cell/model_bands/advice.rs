@@ -1,7 +1,7 @@
 //! Finds the measurements that reduce a cell model's SOC error the most.
 //!
-//! In: [`ModelBands`]. Out: up to [`MOST`] measurements, the most useful first. Each measurement has the error that
-//! remains after it and all measurements before it.
+//! In: [`ModelBands`]. Out: a list of up to [`MOST`] measurements, the most useful first. Each entry states the error
+//! that remains after its measurement and all earlier measurements in the list.
 //!
 //! The expected error is the root mean square error of the SOC, averaged over SOC and over the temperatures of
 //! [`USE_C`]. The SOC comes from one voltage under a usual load and from the charge counted since the last reliable
@@ -19,7 +19,7 @@ use crate::filter::{bell, square};
 
 const MOST: usize = 3;
 
-/// Temperatures of use (degrees C) with their weights, for a car outdoors in a temperate climate.
+/// Temperatures at which cells are used (degrees C) with their weights, for a car outdoors in a temperate climate.
 const USE_C: [(f64, f64); 4] = [(-7.0, 0.15), (3.0, 0.25), (20.0, 0.4), (35.0, 0.2)];
 /// SOC values over which the errors are averaged.
 const USE_SOC: [f64; 10] = [0.05, 0.15, 0.25, 0.35, 0.45, 0.55, 0.65, 0.75, 0.85, 0.95];
@@ -84,7 +84,7 @@ pub fn advise(bands: &ModelBands<'_>) -> Option<(f64, Vec<Advice>)> {
     Some((first_points, advice))
 }
 
-/// Present knowledge about a model at the points of use and at the points that can be measured.
+/// Uncertainty of a model at the points at which the error is averaged, and at the points that can be measured.
 #[derive(Clone)]
 struct Belief {
     /// Slope of the curve (V per unit of SOC) at [`USE_SOC`], and at [`REST_SOC`].
@@ -129,8 +129,9 @@ impl Belief {
     }
 
     fn points(&self) -> f64 {
-        // Half of the capacity is assumed to have moved since the last reliable voltage. Even with the right capacity,
-        // the counted SOC has an error of 6 %, because of its initial value and the current sensor.
+        // Assumption: since the last reliable voltage, the cell was charged or discharged by half of its capacity. Even
+        // with the right capacity, the counted SOC has an error of 6 %, because of its initial value and the current
+        // sensor.
         let counted = square(0.06) + square(0.5 * self.capacity_std);
         let at = |t: usize, s: usize| {
             let of_drop = self.resistance[s][t][t] * square(self.drop_v[t][s]);
@@ -146,8 +147,8 @@ impl Belief {
         match measurement {
             Measurement::Rest(soc) => {
                 let place = REST_SOC.iter().position(|known| known == soc).unwrap_or(0);
-                // The voltage after an hour of rest has an error. The SOC has an error because it was counted since
-                // another rest.
+                // Two errors: the voltage after an hour of rest (5 mV), and the SOC, which was counted since another
+                // rest (2 %).
                 let noise_v = f64::hypot(0.005, 0.02 * self.rest_slope_v[place]);
                 condition(&mut after.curve, USE_SOC.len() + place, square(noise_v));
             }
@@ -163,7 +164,7 @@ impl Belief {
     }
 }
 
-/// Updates a covariance with an observation of element `at` that has this error variance.
+/// Updates a covariance with an observation of element `at`. `variance` is the error variance of the observation.
 fn condition(covariance: &mut [Vec<f64>], at: usize, variance: f64) {
     let column: Vec<f64> = covariance.iter().map(|row| row[at]).collect();
     let total = column[at] + variance;

@@ -1,4 +1,5 @@
-//! Tests the uncertainty bands of models from labels and of a model without a stated error. Also tests the advice.
+//! Tests the uncertainty bands of models that are built from a label (chemistry and rated capacity), and of a model
+//! without a stated error. Also tests the advice.
 
 use super::*;
 use crate::cell::model::tests::small_model;

@@ -1,15 +1,16 @@
-//! Fits a model to the rows of a notebook over a grid of capacities.
+//! Fits a cell model to recorded rows. The fit is repeated for each capacity of a grid.
 //!
-//! In: a [`Label`] and rows (readings of the mean cell, averaged over a short time). Out: a [`Fit`].
+//! In: a [`Label`] and the rows of a [`Notebook`](crate::cell::notebook::Notebook) (readings of the mean cell, averaged
+//! over a short time). Out: a [`Fit`].
 //!
 //! For each capacity C of the grid, damped Gauss-Newton steps find the most likely values of the other parameters
-//! (maximum a posteriori). The curve has parameters for its voltages and for its sag in the cold. The resistances are
-//! relative to the label's model and have parameters over SOC and temperature. The last parameters are the offset of
-//! the current sensor, and the SOC s_k at the start of each stretch (a period with a continuously measured current).
-//! After the charge q, corrected for the offset, SOC = s_k - q / C.
+//! (maximum a posteriori). Some parameters change the voltages of the open-circuit curve, and its decrease at low
+//! temperature. Others are factors of the resistances that the label's model has, over SOC and temperature. The last
+//! parameters are the offset of the current sensor, and the SOC s_k at the start of each stretch (a period with a
+//! continuously measured current). After the charge q, corrected for the offset, SOC = s_k - q / C.
 //!
-//! The density of a capacity is the density of its best fit times the volume of the other parameters around this fit
-//! (Laplace). If the rows allow two capacities, the density has two maxima.
+//! The probability density of a capacity is the density of its best fit times the volume of the other parameters around
+//! this fit (Laplace's approximation). If the rows allow two capacities, the density has two maxima.
 //!
 //! # Errors of a row
 //! Rows at nearly the same SOC have the same errors of voltage, SOC and voltage drop, so their errors are correlated
@@ -36,8 +37,8 @@ use noise::{NormalEquations, RepeatedErrors};
 
 const DAMPING: Damping =
     Damping { first: 1e-3, fall: 0.2, fall_after_growth: 0.2, growth: 8.0, least: 1e-9, most: 8e6 };
-/// Step of the capacity grid, relative to the rated capacity. The grid has `CAPACITIES` points from 0.52 on. The point
-/// `FIRST_CAPACITY`, where the search starts, is the rated capacity.
+/// Step of the capacity grid, relative to the rated capacity. The grid has `CAPACITIES` points; the lowest is 0.52
+/// times the rated capacity. The search starts at the point `FIRST_CAPACITY`, which is the rated capacity.
 const CAPACITY_STEP: f64 = 0.04;
 const CAPACITIES: usize = 20;
 const FIRST_CAPACITY: usize = 12;
@@ -62,7 +63,8 @@ pub struct Fit {
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Beginning {
     stretch: u32,
-    /// SOC at the start, and offset of the current sensor (A). `covariance` applies at the fitted capacity.
+    /// SOC at the start, and offset of the current sensor (A). `covariance` is their covariance if the capacity equals
+    /// its fitted value.
     means: [f64; 2],
     covariance: [[f64; 2]; 2],
     /// Change of each mean per standard deviation of the capacity.
@@ -70,8 +72,8 @@ struct Beginning {
 }
 
 impl Fit {
-    /// Present SOC (fraction), and covariance of the SOC with the capacity (Ah). `None` outside a stretch, and while
-    /// the present stretch has no rows.
+    /// Present SOC (fraction), and covariance of the SOC with the capacity (Ah). `None` if no stretch is in progress,
+    /// or if the present stretch has no rows.
     pub fn soc(&self, present: Option<PresentStretch>) -> Option<(ScalarGaussian, f64)> {
         let (present, beginning) = present.zip(self.beginning)?;
         let Beginning { stretch, means, covariance, by_capacity } = beginning;

@@ -16,7 +16,7 @@ pub struct FitTask {
     label: Label,
     fleet: Option<FleetPrior>,
     rows: Vec<Row>,
-    /// Number of rows that no fit has used yet; they are at the end of `rows`.
+    /// Number of rows that were not yet used by any fit. These rows are at the end of `rows`.
     new_rows: usize,
     /// Present model (`own`) and previous model (`before`); `None` = the label's model.
     own: Option<OwnModel>,
@@ -37,7 +37,8 @@ pub struct FitFindings {
 }
 
 impl FitTask {
-    /// Creates a task from the rows of a notebook, the present model and the previous model.
+    /// Creates a task from the rows of a notebook (averaged readings from drives and charges), the present model and
+    /// the previous model.
     pub fn new(
         (label, fleet): (Label, Option<&FleetPrior>),
         notebook: &Notebook,

@@ -95,7 +95,8 @@ impl CellFaultDetector {
             let has_bits = cell.bleed.timer.has_bits;
             let soc = if has_bits { soc_per_s * (time.bled_s - middle_s) } else { 0.0 };
             let silent_s = if balancing.is_only_while_sent { 0.0 } else { time.silent_s };
-            // A BMS never bleeds the lowest cell. A cell without bits may have been bled as long as the middle cells.
+            // A BMS never bleeds the lowest cell. If a cell has no bits, it may have been bled for as long as the
+            // middle cells.
             let unseen_s = match has_bits {
                 _ if self.lowest == Some(index) => 0.0,
                 true => time.unknown_s + silent_s,
@@ -136,7 +137,8 @@ mod tests {
         diagnosis
     }
 
-    /// Standard deviation added to the SOC of cell 0 until `end_s`, because the cell may have been bled.
+    /// Ends a row at `end_s`. Returns the standard deviation that this adds to the SOC of cell 0, because the cell may
+    /// have been bled.
     fn lost_std(diagnosis: &mut CellFaultDetector, end_s: f64, balancing: BalancingConfig) -> f64 {
         let variance = |diagnosis: &CellFaultDetector| diagnosis.cells[0].difference.state(SOC).variance;
         let before = variance(diagnosis);

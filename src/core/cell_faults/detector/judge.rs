@@ -1,6 +1,6 @@
-//! Derives findings from the states of the cells, and decides when to report and when to withdraw a finding. The
-//! detector judges the cells at the end of each row (sums of a few minutes of samples). A BMS *bleeds* a cell when it
-//! discharges the cell through a balancing resistor.
+//! Derives findings (probable faults) from the states of the cells, and decides when to report and when to withdraw a
+//! finding. The detector judges the cells at the end of each row (sums of a few minutes of samples). A BMS *bleeds* a
+//! cell when it discharges the cell through a balancing resistor.
 
 use super::CellFaultDetector;
 use crate::cell_faults::difference::{CAPACITY, CHANNEL, CONTACT, Jump, LEAK, RESISTANCE, SOC, STATES};
@@ -8,21 +8,22 @@ use crate::cell_faults::fault::{self, CellFault, CellFaultKind, OUTLIER, REPORTE
 use crate::filter::{ScalarGaussian, normal_cdf};
 use crate::quantity::{CellIndex, DAY_S, Timestamp};
 
-/// Maximum time between the findings of neighbouring cells that count as one replaced module (s). A single cell with
-/// a higher capacity is reported only after this time.
+/// If the capacities of neighbouring cells have risen within this time of each other (s), the cells count as one
+/// replaced module. A single cell with a higher capacity is reported only after this time.
 const SAME_MODULE_S: f64 = 3.0 * DAY_S;
-/// Maximum standard deviation of a known fault size, as a multiple of the limit at which this kind of fault is
-/// reported.
+/// The size of a fault is known if its standard deviation is at most this multiple of the fault's limit. Each kind of
+/// fault has a limit, above which it is reported.
 const KNOWN_LIMITS: f64 = 2.0;
 
 /// If the probability of a leak is at least this, the leak explains a charge difference.
 const LIKELY: f64 = 0.9;
-/// Maximum standard deviation of a known capacity difference, fraction.
+/// A capacity difference is known if its standard deviation is at most this fraction.
 const KNOWN_CAPACITY_STD: f64 = 0.05;
-/// SOC values at which a cell's charge is compared.
+/// A difference in charge must exceed its limit at these SOC values of the pack. Otherwise, the cell has another
+/// capacity.
 const CHARGE_AT: [f64; 2] = [0.2, 0.9];
 
-/// Maximum size shown for a fault that is not yet a finding, as a fraction of its limit.
+/// Until a fault is a finding, the shown size is at most this fraction of the fault's limit.
 const BELOW_LIMIT: f64 = 0.99;
 
 /// If a cell's SOC differs from the other cells' SOC by at least this much, four faults cannot be judged: contact,
@@ -38,7 +39,7 @@ struct Judgement {
     is_comparable: bool,
 }
 
-/// Median of the cells, and a robust standard deviation computed from the median absolute deviation.
+/// Median over the cells, and a robust standard deviation computed from the median absolute deviation.
 pub(super) struct Population {
     pub(super) middle: f64,
     pub(super) std: f64,
@@ -142,7 +143,7 @@ impl CellFaultDetector {
     }
 
     /// Returns the cell with the clearly lowest voltage reading at the SOC at which a BMS bleeds cells. A BMS never
-    /// bleeds this cell, because it follows its own readings, including their errors. The cell stays the lowest until
+    /// bleeds this cell, because it balances by the readings, even if they are wrong. The cell stays the lowest until
     /// another cell reads lower.
     fn clearly_lowest(&self, slope_v: f64) -> Option<usize> {
         let (mut lowest, mut next): (Option<(usize, ScalarGaussian)>, Option<ScalarGaussian>) = (None, None);
@@ -161,9 +162,9 @@ impl CellFaultDetector {
         (next.mean - shown.mean > 2.0 * shown.std().hypot(next.std())).then_some(lowest)
     }
 
-    /// Whether a BMS may bleed the cell without sending a bit that shows it. True for the cells of a balanced pack
-    /// without bits, except the lowest cell and cells with a reported leak. A leaking cell loses charge even while
-    /// the BMS bleeds the other cells instead.
+    /// Whether a BMS may bleed the cell without sending a bit that shows it. True for a cell of a balanced pack if the
+    /// cell has no such bit, is not the lowest cell and has no reported leak. A leaking cell has less charge than the
+    /// other cells, so the BMS bleeds the other cells.
     pub(super) fn may_be_bled(&self, index: usize) -> bool {
         let is_found = |found: &CellFault| found.kind == CellFaultKind::Leak && found.is_of(CellIndex(index as u16));
         let is_open = self.is_balanced && !self.cells[index].bleed.timer.has_bits;
@@ -194,7 +195,8 @@ impl CellFaultDetector {
         let channel = if channel[0].1 >= channel[1].1 { channel[0] } else { channel[1] };
         let mut leak = beyond(LEAK, fault::LEAK_PER_DAY, 1.0);
         if self.may_be_bled(index) {
-            // A leak soon makes this cell the lowest cell, which can be judged. Until then, the leak does no harm.
+            // Bleeding looks like a leak, so the leak cannot be judged now. A real leak soon makes this cell the lowest
+            // cell, which can be judged. Until then, the leak does no harm.
             leak = (ScalarGaussian { mean: 0.0, variance: 0.0 }, 0.0);
         } else if !cell.bleed.timer.has_bits && cell.difference.mean()[SOC] >= populations[SOC].middle {
             // A cell with more charge than the others may be losing it because the BMS bleeds it.
@@ -251,8 +253,8 @@ impl CellFaultDetector {
 
     /// Difference in charge, and the probability that it is beyond the limit. `sign`: 1 for more charge than the
     /// other cells, -1 for less. The probability is 0 while the cell's capacity is unknown. It is also 0 if the
-    /// difference is within the limit when the pack is nearly full or nearly empty. The cell then has another
-    /// capacity.
+    /// difference is within the limit when the pack is nearly full or nearly empty, because then the cell's capacity
+    /// differs.
     pub(super) fn constant_charge(
         &self,
         index: usize,
@@ -306,8 +308,8 @@ impl CellFaultDetector {
 
     /// Whether a fault of this kind has been likely for long enough to be reported. A charge difference must be
     /// constant for a day, because it may be the beginning of a leak. In a balanced pack, a leak must also last for a
-    /// day. Until the cell has completed a cycle, other changes look like a leak. A cell with a higher capacity may
-    /// belong to a replaced module, whose other cells are found later.
+    /// day, because other changes look like a leak until the cell has completed a cycle. A higher capacity must last
+    /// for [`SAME_MODULE_S`], because the cell may belong to a replaced module whose other cells are found later.
     fn has_lasted(&self, kind: CellFaultKind, since: Timestamp, now: Timestamp) -> bool {
         let settling_s = match kind {
             CellFaultKind::Leak if self.is_balanced => DAY_S,
@@ -349,8 +351,8 @@ impl CellFaultDetector {
     }
 
     /// Joins neighbouring cells into a replaced module if they have had more capacity than the other cells since
-    /// about the same time. `foreign`: for each cell, the module finding that includes it. Otherwise, its finding of
-    /// a higher capacity with a probability of at least [`REPORTED`].
+    /// about the same time. `foreign` has an entry per cell: the module finding that includes the cell or, if there is
+    /// none, the cell's finding of a higher capacity with a probability of at least [`REPORTED`].
     fn find_modules(&mut self, time: Timestamp, foreign: &[Option<CellFault>]) {
         let is_same_event = |a: &Option<CellFault>, b: &Option<CellFault>| {
             a.zip(*b).is_some_and(|(a, b)| a.since.since(b.since).abs() <= SAME_MODULE_S)

@@ -1,8 +1,9 @@
-//! Computes what a cell's voltage difference in a row (sums of a few minutes of samples) says about the cell's
-//! states.
+//! A row summarises a few minutes of samples. This module computes what the voltage difference in a row says about a
+//! cell's states. The states explain the difference: for example, the cell's SOC or resistance differs from the mean
+//! cell's, or its voltage channel has an offset.
 //!
-//! In: the values of the row that all cells share, the means of a cell's states, and the cell's voltage minus the
-//! middle voltage of the pack (V). Out: an [`Observation`].
+//! In: the values of the row that all cells share, the estimated means of a cell's states, and the voltage difference
+//! (the cell's voltage minus the middle voltage of the pack, V). Out: an [`Observation`].
 
 use crate::cell::{CellModel, GridPosition};
 use crate::cell_faults::difference::{CHANNEL, CONTACT, Observation, RESISTANCE, SOC, STATES};
@@ -13,9 +14,9 @@ use crate::filter::ScalarGaussian;
 const ROW_V: f64 = 0.002;
 const ROW_DROP: f64 = 0.03;
 const ROW_CURVE: f64 = 0.001;
-/// Additional errors of a cell, per unit of SOC difference from the mean cell: `FAR_V` in the open-circuit voltage
-/// (V) and `FAR_DROP` in the voltage drop (fraction). `MOST_ELSEWHERE` limits the ratio between the model's
-/// resistances at the two SOC values.
+/// Additional errors of a cell, per unit of SOC difference from the mean cell: `FAR_V` in the open-circuit voltage (V)
+/// and `FAR_DROP` in the voltage drop (fraction). `MOST_ELSEWHERE` limits the model's resistance at the cell's SOC,
+/// divided by its resistance at the mean cell's SOC.
 const FAR_V: f64 = 0.05;
 const FAR_DROP: f64 = 1.0;
 const MOST_ELSEWHERE: f64 = 3.0;
@@ -62,8 +63,7 @@ impl Row<'_> {
         self.model.grid_position((self.curve_soc + charge).clamp(0.0, 1.0), self.temperature_c)
     }
 
-    /// Difference in open-circuit voltage (V) that the model gives for a SOC that differs by `charge` from the mean
-    /// cell's.
+    /// Change of the model's open-circuit voltage (V) from the mean cell's SOC to that SOC plus `charge` (fraction).
     pub(super) fn curve_v(&self, charge: f64) -> f64 {
         let ocv_v = |charge: f64| self.model.aged_ocv_v(&self.at(charge), self.capacity_ah);
         ocv_v(charge) - ocv_v(0.0)

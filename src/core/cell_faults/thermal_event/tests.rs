@@ -5,7 +5,8 @@ use super::*;
 const CELLS: usize = 6;
 const SENSORS: usize = 3;
 
-/// A pack of six cells and three sensors, each for two cells. All readings come once a second.
+/// A pack of six cells and three sensors, each for two cells. Unless a test changes `every`, all readings come once a
+/// second.
 struct Pack {
     watch: ThermalWatch,
     second: u32,
@@ -40,8 +41,8 @@ impl Pack {
         Timestamp::from_secs(f64::from(self.second))
     }
 
-    /// Simulates some seconds and calls `change` before each second. Returns second, cell and value of the first
-    /// evidence.
+    /// Simulates some seconds and calls `change` before each second. Returns the second, the cell and the value of the
+    /// first evidence of a thermal event.
     fn run(&mut self, seconds: u32, mut change: impl FnMut(u32, &mut Self)) -> Option<(u32, usize, f64)> {
         for second in 0..seconds {
             change(second, self);
@@ -72,7 +73,7 @@ impl Pack {
 
 #[test]
 fn collapse_of_one_voltage_is_found_after_three_seconds() {
-    // A collapse may begin at any time between two refreshes.
+    // A collapse may begin at any time between two refreshes of the reference voltages.
     for (lasting_v, wait) in [(2.7, 0), (1.0, 7), (0.0, 15), (-0.1, 29)] {
         let mut pack = Pack::at_rest();
         pack.run(wait, |_, _| {});
@@ -110,7 +111,7 @@ fn other_falls_raise_no_event() {
     assert_eq!(empty.run(300, |second, pack| pack.volts[2] = 2.5 + moving(second)), None, "almost empty");
     let flicker = |second: u32, pack: &mut Pack| pack.volts[2] = if second % 3 == 2 { 3.7 } else { 0.5 };
     assert_eq!(rest().run(300, flicker), None, "disturbance of two seconds");
-    // A contact of 5 mohm at a cell of 126 Ah, with a current of 2 C.
+    // A bad contact of 5 mohm at a cell of 126 Ah, with a discharge current of 2 C (252 A).
     let contact = |second: u32, pack: &mut Pack| {
         pack.rate_per_h = Some(2.0);
         pack.volts = [3.6; CELLS];
@@ -201,8 +202,8 @@ fn sensor_ahead_of_others_is_found() {
 
 #[test]
 fn heat_of_current_is_deducted() {
-    // At 4 C, the current explains 1.6 degrees C/s at first, a rise of 80 degrees C, and 16 degrees C between the
-    // sensors.
+    // The current is four times the rated capacity per hour. It explains an initial rise of 1.6 degrees C/s, a total
+    // rise of 80 degrees C, and a difference of 16 degrees C between the sensors.
     let mut pack = Pack { rate_per_h: Some(-4.0), ..Pack::at_rest() };
     let mut warmer = |_, pack: &mut Pack| {
         pack.temperatures_c = pack.temperatures_c.map(|it| it + 0.05 * (105.0 - it).clamp(0.0, 32.0));

@@ -4,11 +4,11 @@
 //! In: level and rate of fade with their standard deviations, and the loss and use since the highest level. Out:
 //! probabilities and quantiles of the use. Losses and capacities are fractions of the reference capacity.
 //!
-//! Shapes: the rate of fade is r ((l + l0) / (lost + l0))^a. Here, r is the present rate, l is the loss since the
-//! highest level, `lost` is the present loss, and l0 is [`ONSET`]. The exponent a sets the shape of the loss as a
-//! function of the use: a = -1 is a square root, 0 a straight line, 0.5 a parabola, and 1 an exponential. An exponent
-//! above 1 is a knee that becomes steeper without limit. The use for a loss from l1 to l2 has a closed form
-//! ([`use_of_loss`]).
+//! Shapes: at a loss l since the highest level, the rate of fade is r ((l + l0) / (lost + l0))^a. Here, r is the
+//! present rate, `lost` is the present loss, and l0 is [`ONSET`]. The exponent a sets the shape of the loss as a
+//! function of the use: a = -1 is a square root, 0 a straight line, 0.5 a parabola, and 1 an exponential. If a is above
+//! 1, the curve has a knee and becomes steeper without limit. The use in which the loss grows from l1 to l2 has a
+//! closed form ([`use_of_loss`]).
 //!
 //! The posterior of (a, ln r) on a grid of [`SHAPES`] x [`RATES`] nodes is the product of four terms:
 //! * the prior of the exponent: a t distribution around [`EXPONENT`], mixed with a normal distribution around a
@@ -16,15 +16,15 @@
 //! * the prior of the mean rate over the next [`TYPICAL_LOSS`]: a Cauchy distribution (see [`PriorRate`]), which
 //!   dominates for a cell that has hardly lost capacity. Because of its heavy tails, a measured rate can replace it;
 //! * the rate that the filter has found;
-//! * the curvature so far: shape and rate together imply the use since the highest level. The deviation from the actual
-//!   use has a t distribution.
+//! * the curvature so far: shape and rate together imply how much use has passed since the highest level. The deviation
+//!   of the implied use from the actual use has a t distribution.
 //!
 //! The use until the threshold is computed from the shape, for [`SLICES`] slices of the uncertain level. It is
 //! multiplied by a lognormal deviation, which covers future changes of the rate ([`SPREAD_LOSS`]) and the error of any
 //! shape ([`SPREAD`]).
 //!
-//! Assumptions: the level passes the threshold once. The posterior does not depend on the threshold, so probabilities
-//! for several thresholds agree with each other.
+//! Assumption: the level passes the threshold only once. The posterior does not depend on the threshold, so
+//! probabilities for several thresholds agree with each other.
 
 use crate::filter::{bell, normal_cdf, square};
 
@@ -37,17 +37,20 @@ const EXPONENT_FREEDOM: f64 = 3.0;
 /// Prior probability of a steady fade, and standard deviation of its exponent around 0.
 const STEADY_SHARE: f64 = 0.05;
 const STEADY_STD: f64 = 0.5;
-/// Scale of the relative deviation between the loss that a shape implies and the observed loss.
+/// A shape implies how much use has passed since the highest level. Scale of the deviation of this use from the actual
+/// use, relative to this use.
 const CURVATURE: f64 = 0.3;
-/// Scale of this deviation for a small loss (fraction of the reference).
+/// Minimum of this scale, after multiplication by the rate of fade (fraction of the reference). It matters only for a
+/// small loss.
 const CURVATURE_FLOOR: f64 = 0.01;
 /// Loss over which the prior of the rate is stated.
 const TYPICAL_LOSS: f64 = 0.1;
-/// Equivalent full cycles in which a typical cell loses `TYPICAL_LOSS`: 800 cycles to 80 %.
+/// Equivalent full cycles in which a typical cell loses `TYPICAL_LOSS`. At a constant rate, this is 800 cycles to 80 %.
 const TYPICAL_CYCLES: f64 = 400.0;
 /// Scale of the prior of ln(rate), for a rate per cycle and for a rate per day.
 const TYPICAL_SCALE: (f64, f64) = (0.7, 2.0);
-/// Added to the loss (fraction of the reference) if the prior is the mean rate so far, so that this rate is above 0.
+/// If the prior is the mean rate so far, this is added to the loss (fraction of the reference), so that the rate is
+/// above 0.
 const LEAST_LOSS: f64 = 0.01;
 /// Standard deviation of ln(use) over one e-fold of the loss. It grows with the square root of the number of e-folds.
 const SPREAD_LOSS: f64 = 0.25;
@@ -162,7 +165,8 @@ impl FadePosterior {
         let (level, level_std) = self.state.level;
         // The minimum avoids a division by 0 if the level is known exactly; all slices are then equal.
         let level_std = level_std.max(1e-12);
-        // Deviation from the mean, in standard deviations, at which the level has passed the threshold.
+        // The threshold minus the mean of the level, in standard deviations. If the deviation of the true level from
+        // the mean is below this value, the level has already passed the threshold.
         let zero = (threshold - level) / level_std;
         let from = zero.max(-SLICED);
         let width = (SLICED.max(from + 1.0) - from) / SLICES as f64;

@@ -146,8 +146,8 @@ fn lasting_errors_of_equal_half_cycles_stay_in_interval() {
     let sensor = SensorErrors { voltage_offset_v: 0.004, current_gain: 0.005, ..SensorErrors::NONE };
     let deviations = deviations_after_thousand_half_cycles(&config, sensor);
     assert!(deviations.abs() < 1.96, "{deviations}");
-    // If the filter treated these errors as noise, they would average out, and the interval would exclude the true
-    // capacity.
+    // If the filter treated the voltage's error as new noise in each half-cycle, it would expect the error to average
+    // out, and the interval would exclude the true capacity.
     let without =
         deviations_after_thousand_half_cycles(&CapacityConfig { end_error_v: Some(0.0), ..config }, SensorErrors::NONE);
     assert!(without.abs() > 3.0, "{without}");
@@ -217,14 +217,15 @@ fn label_learns_capacity_from_trips_and_charges() {
     assert!(learner.has_learned(0), "{capacity:?}");
     assert!((capacity.mean - 1.6).abs() < 2.0 * capacity.std(), "{capacity:?}");
     assert!(capacity.mean < 1.8 && capacity.std() < 0.17, "{capacity:?}");
-    // The curve's error is the same in all spans, so the uncertainty stays above 0.
+    // The error of the open-circuit curve is the same in every discharge and charge. It does not average out, so the
+    // uncertainty stays above 0.
     assert!(capacity.std() > 0.02, "{capacity:?}");
 }
 
 #[test]
 fn doubtful_charge_ends_span_and_teaches_nothing() {
     let learner = learned_by_label(true);
-    // Only the second part of a discharge is known, from SOC 0.72 to 0.3.
+    // Only the charge of the second part of each discharge is known, from SOC 0.72 to 0.3.
     let capacity = learner.capacity(0);
     assert!((capacity.mean - 1.6).abs() < 2.0 * capacity.std(), "{capacity:?}");
     assert!(capacity.std() > learned_by_label(false).capacity(0).std(), "{capacity:?}");

@@ -1,4 +1,5 @@
-//! Compares the outlook with a simulated circuit, and its variances with the errors that cause them.
+//! Compares the outlook (energy, time and power that a pack can deliver or take up) with a simulated circuit, and its
+//! variances with the errors that cause them.
 
 use super::*;
 use crate::cell::Discretisation;
@@ -124,7 +125,8 @@ fn power_reaches_limit_of_voltage_or_current() {
             near(steps.last().unwrap(), limit_v, 0.005);
         }
     }
-    // Near the end of a steep curve, the charge of 30 s lowers the voltage more than the resistance does.
+    // If the open-circuit curve is steep near empty, the charge drawn in 30 s lowers the voltage more than the
+    // resistance does.
     let mut steep = small_model();
     for table in [&mut steep.r0_ohm, &mut steep.branches[0].r_ohm] {
         table.values.iter_mut().flatten().for_each(|ohm| *ohm *= 0.1);
@@ -177,7 +179,8 @@ fn each_error_widens_what_depends_on_it() {
         of_one(cell, (Mode::Discharge, 1.0))
     };
     let known = of(|_| {});
-    // Only the future load is uncertain: 1.2 Ah at 1 A through 0.08 to 0.12 ohm, or a load that is a third larger.
+    // Only the future load is uncertain. At 1 A, 1.2 Ah flow through 0.08 to 0.12 ohm. A load that is a third larger
+    // loses a third more energy in this resistance.
     near(known.remaining_wh.std(), LOG_LOAD_STD.exp_m1() * 1.2 * 0.095, 0.08);
     near(known.to_empty_s.unwrap().std(), LOG_LOAD_STD.exp_m1() * 1.2 * 3600.0, 0.01);
     assert!(known.discharge_w.iter().chain(&known.charge_w).all(|power| power.variance == 0.0));
@@ -186,7 +189,7 @@ fn each_error_widens_what_depends_on_it() {
     near(more(&of(|cell| cell.capacity.variance = square(0.1))), 0.05 * known.remaining_wh.mean, 0.05);
     let by_resistance = of(|cell| cell.log_resistance_std = 0.1);
     near(by_resistance.discharge_w[1].std(), 0.1 * known.discharge_w[1].mean, 0.15);
-    // At a SOC of 0, the error can lie on one side only.
+    // At an SOC of 0, the true SOC can only be higher.
     let empty = of(|cell| (cell.soc.mean, cell.soc.variance) = (0.0, square(0.02)));
     near(empty.remaining_wh.std(), 0.02 * 2.0 * 2.9, 0.05);
 }

@@ -1,4 +1,5 @@
-//! Compares the counts with profiles whose times and events are known: limits, rest, half-cycles, gaps, restarts.
+//! Feeds profiles with known times and events to the counter and checks its counts: limits, rest, half-cycles, gaps,
+//! restarts.
 
 use super::*;
 
@@ -154,7 +155,7 @@ fn rest_at_high_soc_includes_gaps_only_if_parked() {
         [known_s, above_80_s, above_90_s, unknown_s]
     };
     close(rest(10, &full, 3600), [10.0, 10.0, 10.0, 0.0]);
-    // The first SOC after the gap arrives later. For the gap, the lower of the two SOC values counts.
+    // The first SOC after the gap arrives later. For the gap, the lower of the SOC values before and after it counts.
     close(rest(1, &UseSample::default(), 0), [10.0, 10.0, 10.0, 0.9]);
     let parked = UseSample { soc: Some(0.9), ..REST };
     close(rest(10, &parked, 3600), [3620.1, 3620.1, 10.0, 0.9]);

@@ -5,9 +5,10 @@
 //! outputs apply at once. The monitor keeps filters, learned values, counters, schedules, and alarms whose rule and
 //! severity are still configured. Estimates therefore change only if their settings change.
 //!
-//! If the recharge window changes, the measured recharge periods become unknown, unless they can be converted exactly.
-//! If the load of the usable capacity changes, the usable capacity becomes unknown. Initial values affect only cells
-//! without learned values, so changed initial values apply when the next pack is connected.
+//! If the recharge window (the SOC range over which charges are timed) changes, the measured recharge periods become
+//! unknown, unless they can be converted exactly. If the load of the usable capacity changes, the usable capacity
+//! becomes unknown. Initial values affect only cells without learned values, so changed initial values apply when the
+//! next pack is connected.
 
 use crate::alarm::{Observation, Rule};
 use crate::health::HealthConfig;
@@ -18,8 +19,8 @@ use crate::monitor::stage::publisher::Publisher;
 use crate::quantity::Timestamp;
 
 impl Monitor {
-    /// Applies a new configuration between two inputs. `now` is the time of the request. The event about the change has
-    /// this time or the clock's time, whichever is later. The clock does not advance.
+    /// Applies a new configuration between two inputs. `now` is the time of the request; it does not advance the
+    /// monitor's clock. The event about the change gets the later of `now` and the clock's time.
     ///
     /// # Errors
     /// The first setting that needs a restart. The monitor is then unchanged.
@@ -69,7 +70,8 @@ impl Monitor {
         Ok(Reconfigured { changed, alarms_ended })
     }
 
-    /// Forgets values that were measured with another window or load. Runs before the new thresholds are set.
+    /// Forgets values that were measured with another recharge window or another load of the usable capacity. Runs
+    /// before the new thresholds are set.
     fn forget_measures(&mut self, old: &HealthConfig, out: &mut Outputs) {
         let now = self.clock.now;
         let cells = self.stages.estimation.cell_indices();

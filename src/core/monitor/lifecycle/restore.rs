@@ -198,7 +198,8 @@ impl Stages {
         let stored = cells.iter().map(|cell| (cell.consumed, cell.trusted, cell.model_check));
         estimation.restore(stored, batch);
         if is_changed {
-            // A resistance is stored relative to its model, so it means nothing with another label or prior.
+            // A resistance is stored relative to its model. If the model now comes from another label or prior, the
+            // stored resistance has no meaning.
             let capacity = learning.state.learner.capacity(estimation.bank.own_cells()[0]);
             let adoption = modelling.other_model_adoption(estimation.mean_estimate(), capacity);
             estimation.adopt(&adoption, &mut learning.state.learner, &learning.config.capacity);

@@ -11,7 +11,8 @@ use crate::quantity::BusIndex;
 pub enum Command {
     /// Acknowledge alarms.
     Acknowledge(Selector),
-    /// End latched alarms and forget past alarms; learned values are kept.
+    /// End latched alarms (which stay raised after their value is healthy again) and forget past alarms. Learned values
+    /// are kept.
     Clear(Selector),
     /// Another pack is connected: forget the learned values of the old pack.
     PackReplaced,

@@ -1,4 +1,5 @@
-//! Events of the [`Monitor`](crate::monitor::Monitor), which the driver logs and the history records.
+//! Events of the [`Monitor`](crate::monitor::Monitor). The driver (the program around the core) logs them, and the
+//! history records them.
 
 use serde::{Deserialize, Serialize};
 use strum::{IntoStaticStr, VariantNames};
@@ -61,8 +62,8 @@ pub enum EventKind {
         #[serde(flatten)]
         values: RecordedValues,
     },
-    /// Lithium and active material that a cell has lost, as fractions of the model's new cell. Sent after a half-cycle,
-    /// once the cell's capacity has been measured.
+    /// Lithium and active material that a cell has lost, as fractions of what the model's new cell contains. Sent after
+    /// a half-cycle, once the cell's capacity has been measured.
     LossModes {
         cell: CellIndex,
         /// Loss of lithium inventory.
@@ -101,7 +102,7 @@ pub enum EventKind {
         #[serde(flatten)]
         values: RecordedPackValues,
     },
-    /// A charge that covered the recharge window (a configured SOC range), or enough of it, has ended.
+    /// A charge has ended that covered all or enough of the recharge window (a configured SOC range).
     RechargePeriod {
         /// Time between the two ends of the window (s); `None` if the charge did not cover the whole window without
         /// interruption.
@@ -251,7 +252,7 @@ pub enum EventKind {
         /// Duration (s); `None` = unknown.
         seconds: Option<f64>,
     },
-    /// The driver's clock was set back: an input came with a time more than one second before the latest time.
+    /// The driver's clock was set back: the time of an input was more than one second before the latest time.
     TimeBackwards {
         /// Size of the step back (s).
         seconds: f64,

@@ -1,4 +1,4 @@
-//! Alarming stage: holds the alarm engine, and the state that the comparison of values with the rules needs.
+//! Alarming stage: holds the alarm engine, and the state that is needed to compare values with the alarm rules.
 //!
 //! In: values of the rules, from the [`Publisher`](super::publisher::Publisher) and the periodic
 //! [`watch`](crate::monitor::stages::watch). Out: raised alarms and their changes.
@@ -9,13 +9,14 @@ use crate::alarm::{AlarmChange, AlarmEngine, AlarmSnapshot, Observation, Rule, R
 use crate::monitor::config::MonitorConfig;
 use crate::quantity::{CellIndex, Timestamp};
 
-/// Period for refreshing displayed values that change no alarm (s).
+/// Values that change no alarm are only displayed. Period in which the displayed values are refreshed (s).
 const SHOW_S: f64 = 1.0;
 
 #[derive(Debug)]
 pub(crate) struct Alarming {
     pub(crate) engine: AlarmEngine,
-    /// Shortest silence that a configured threshold reports as a missing input (s); `None` without such a rule.
+    /// Lowest threshold of the rule `input_missing` (s): a longer silence of an input is reported. `None` = the rule is
+    /// not configured.
     pub(crate) missing_after_s: Option<f64>,
     /// Changes that wait to be published.
     pub(crate) changes: Vec<AlarmChange>,
@@ -28,11 +29,11 @@ pub(crate) struct Alarming {
 #[derive(Debug, Clone, Copy, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct AlarmingState {
-    /// Time of the last refresh of displayed input values that change no alarm.
+    /// Time of the last refresh of the displayed input values.
     pub(crate) inputs_shown_at: Option<Timestamp>,
-    /// Time of the last refresh of displayed innovations that change no alarm.
+    /// Time of the last refresh of the displayed innovations.
     pub(crate) innovations_shown_at: Option<Timestamp>,
-    /// Whether every learned value is marked in the engine as having valid inputs.
+    /// Whether the engine has every learned value marked as valid, because its inputs are received.
     pub(crate) knows_all_valid: bool,
     pub(crate) store: StoreHealth,
 }
@@ -42,13 +43,13 @@ pub(crate) struct AlarmingState {
 pub(crate) struct StoredAlarming {
     /// Pending, raised and past alarms.
     pub(crate) alarms: AlarmSnapshot,
-    /// Every alarm that is not in its initial state, with its latest value; empty in a state for a restart.
+    /// Every alarm that is not in its initial state, with its latest value. Empty after [`Self::restart`].
     running: Vec<RunningAlarm>,
     state: AlarmingState,
 }
 
 impl StoredAlarming {
-    /// Drops the latest values, so that every value is compared again.
+    /// Drops the latest values, so that a restarted process compares every value again.
     pub(crate) fn restart(&mut self) {
         self.running.clear();
         self.state = AlarmingState::default();
@@ -81,7 +82,8 @@ impl Alarming {
         self.state = stored.state;
     }
 
-    /// Replaces the rules. Returns how many of the dropped alarms were pending or had been raised.
+    /// Replaces the rules, and drops the alarms of removed rules. Returns how many of these alarms were pending or had
+    /// been raised.
     pub(crate) fn reconfigure(&mut self, now: Timestamp, config: &MonitorConfig) -> usize {
         self.missing_after_s = missing_after_s(&config.rules);
         self.state.knows_all_valid = false;
@@ -103,7 +105,7 @@ pub(crate) fn take_show_due(shown_at: &mut Option<Timestamp>, now: Timestamp) ->
     is_due
 }
 
-/// Whether the files can be written; unknown before the driver's first report.
+/// Whether the files can be written; unknown before the first report about the files.
 #[derive(Debug, Clone, Copy, Default, Serialize, Deserialize)]
 pub(crate) struct StoreHealth {
     is_known: bool,
@@ -111,7 +113,8 @@ pub(crate) struct StoreHealth {
 }
 
 impl StoreHealth {
-    /// Handles the driver's report. Returns whether it is the first report or differs from the previous report.
+    /// Handles a report on whether the files can be written. Returns whether it is the first report or differs from the
+    /// previous report.
     pub(crate) fn handle_report(&mut self, now: Timestamp, works: bool) -> bool {
         let was_failing = self.failing_since.is_some();
         let is_change = !self.is_known || was_failing == works;

@@ -32,7 +32,8 @@ const DOUBT: f64 = 2.0;
 /// trusted again. With the default limit, a correct filter has this contradiction on average.
 const RETURN: f64 = 0.25;
 
-/// Value of `Consumed::path_v` that marks a frozen voltage (V), far outside the range of [`CurrentCheck::path_v`].
+/// Value of `Consumed::path_v` that marks a frozen voltage (V). It is far outside the range of [`CurrentCheck::path_v`]
+/// (sum of all voltage changes that the cells have in common).
 const FROZEN_PATH_V: f64 = 1e9;
 
 #[derive(Debug)]
@@ -68,8 +69,8 @@ pub(crate) struct EstimationState {
     pub(crate) current_check: CurrentCheck,
 }
 
-/// What a cell's filter has used so far. Stored apart from the filters for cache locality, because every sample updates
-/// this data.
+/// The sampler's data that a cell's filter has already used. Stored apart from the filters for cache locality, because
+/// every sample updates this data.
 #[derive(Debug, Clone, Copy, Default)]
 struct CellProgress {
     /// Sampler totals at the last step; `None` before the first step.
@@ -195,8 +196,8 @@ impl Estimation {
             self.bank.add(cell, &step);
         }
         self.bank.step();
-        // A wrong current makes the SOC of most cells jump. Jumps at rest do not count. A small current that is not
-        // exactly zero shows that the sensor works and the pack rests.
+        // A wrong current makes the SOC of most cells jump. Jumps at rest do not count: if the measured current is
+        // small but not exactly zero, the sensor works and the pack rests.
         let rest_a = self.bank.own_config().gap.rest_current_a;
         let is_rest = |sample: &CellSample| sample.current_a.is_some_and(|a| a != 0.0 && a.abs() <= rest_a);
         let has_jumped = |sample: &&CellSample| self.bank.result(sample.cell.index()).jumped && !is_rest(sample);
@@ -280,7 +281,7 @@ impl Estimation {
         let branches_v: f64 = cell.branch_v().into_iter().filter(|branch_v| branch_v.is_finite()).sum();
         let ocv_v = sample.voltage_v + current_a * model.r0_ohm(&position) * ratio + branches_v;
         let soc = model.soc_of_aged_ocv(&temperature, cell.curve().mean, ocv_v);
-        // The curve is extrapolated a little beyond its ends.
+        // An SOC slightly outside 0 to 1 is accepted, because the curve is extrapolated a little beyond its ends.
         (-0.05..=1.05).contains(&soc).then_some(soc)
     }
 

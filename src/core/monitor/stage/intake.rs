@@ -1,8 +1,9 @@
 //! Intake stage: turns frames into checked readings and commands.
 //!
 //! In: frames with their time, events of the interfaces. Out: the readings or the command of an admitted frame, counts,
-//! and an event for each change. If a frame fails its end-to-end check, its readings are bad, not missing. Frames
-//! beyond the flood limit are dropped and counted.
+//! and events, for example when a flood of frames starts or ends. If a frame fails its end-to-end check, its readings
+//! are bad, not missing. If a message arrives more often than its limit allows (a flood), the excess frames are dropped
+//! and counted.
 
 use serde::{Deserialize, Serialize};
 

@@ -1,4 +1,5 @@
-//! Learning stage: turns estimates and the pack current into half-cycles, and half-cycles into health values.
+//! Learning stage: turns estimates and the pack current into half-cycles (charges and discharges), and half-cycles into
+//! health values.
 //!
 //! In: the pack current, the cells' filters and samples. Out, passed to the [`Publisher`] as events and alarm values:
 //! * changes of mode;
@@ -210,8 +211,9 @@ impl Learning {
     }
 
     /// Ends a mode. If this completes a half-cycle, every cell learns from the half-cycle. `is_label`: whether the
-    /// model of the cells outside modules comes from a label and has not been learned. `is_doubtful`: for each cell,
-    /// whether the current was doubtful or the cell's voltage is frozen. A doubtful cell learns no capacity.
+    /// pack's cell model is still the model of the label (chemistry and rated capacity), so it was neither given as a
+    /// file nor learned. Cells in modules with other cells have their own model. `is_doubtful`: for each cell, whether
+    /// the current was doubtful or the cell's voltage is frozen. A doubtful cell learns no capacity.
     pub(crate) fn complete_mode(
         &mut self,
         change: ModeChange,
@@ -341,8 +343,8 @@ impl Learning {
         }
     }
 
-    /// Handles a reset of a cell's filter. The capacity becomes doubtful. The recharge timer restarts, because the SOC
-    /// jumped without charge.
+    /// Handles a reset of a cell's filter. The capacity becomes doubtful. The recharge timer restarts, because the
+    /// reset changes the SOC without a flow of charge.
     pub(crate) fn handle_reset(&mut self, cell: CellIndex, bank: &mut PackBank) {
         self.state.recharge = RechargeTimer::default();
         let new_std_ah = bank.config(cell.index()).initial.capacity_std_ah;
@@ -351,8 +353,9 @@ impl Learning {
         bank.put(cell.index(), &estimator);
     }
 
-    /// Combines the cells into the pack's values. If a charge has just crossed the recharge window, records the raw
-    /// recharge period. `all_fresh`: whether every cell's voltage is fresh.
+    /// Combines the cells into the pack's values. If a charge has just passed the upper end of the recharge window (the
+    /// SOC range `from_soc` to `to_soc`), records the raw, that is, measured recharge period. `all_fresh`: whether
+    /// every cell's voltage is fresh.
     pub(crate) fn combine_pack(&mut self, all_fresh: bool, bank: &PackBank, to: &mut Publisher<'_>) {
         self.state.pack = if all_fresh { self.combined(bank) } else { None };
         let Some(pack) = self.state.pack else { return };
@@ -374,8 +377,8 @@ impl Learning {
         }))
     }
 
-    /// Ends a charge and publishes its raw and normalised recharge periods. `has_learned`: whether the cells learned
-    /// from the charge.
+    /// Ends a charge and publishes its recharge periods: raw (as measured) and normalised (as with the reference
+    /// charger). `has_learned`: whether the cells learned from the charge.
     fn finish_charge(&mut self, has_learned: bool, bank: &PackBank, to: &mut Publisher<'_>) {
         let config = &self.config.recharge;
         let charged = self.state.recharge.finish(config);
@@ -418,7 +421,8 @@ impl Learning {
             self.state.recharge.change_window();
             self.state.recharge_period_s = None;
         }
-        // The old and the new normalised period follow from the same capacity.
+        // A normalised period is computed from the capacity, so it can be scaled to the new window and reference
+        // current.
         let seconds_per_ah = |config: &RechargeConfig| (config.to_soc - config.from_soc) / config.reference_current_a;
         let ratio = seconds_per_ah(new) / seconds_per_ah(old);
         self.state.normalised_recharge = self

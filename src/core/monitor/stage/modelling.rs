@@ -253,7 +253,7 @@ impl Modelling {
         self.state.has_row && self.state.fit_since.is_none()
     }
 
-    /// Closes a row at the mean SOC of the cells.
+    /// Adds the complete row to the notebook. `soc`: mean SOC of the cells.
     pub(crate) fn close_row(&mut self, soc: f64) {
         self.state.has_row = false;
         self.state.notebook.close_row(&self.notebook, soc);

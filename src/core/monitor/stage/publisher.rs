@@ -1,7 +1,7 @@
 //! End of the data path: publishes events, alarm values and the resulting frames at the time of one input.
 //!
-//! A stage publishes an event or the value of a rule. If an alarm changes, the publisher immediately adds an event, the
-//! alarm's frame and the J1939 trouble codes.
+//! Each stage of the data path publishes its events and its values for the alarm rules here. If a value changes an
+//! alarm, the publisher immediately adds an event, the alarm's frame and the J1939 trouble codes.
 
 use super::alarming::Alarming;
 use super::sending::Sending;

@@ -35,8 +35,8 @@ pub(crate) struct SamplingState {
 }
 
 impl SamplingState {
-    /// Drops what is valid only in the present run: the candidate for the pack's identity, and whether a usable reading
-    /// or a second sender was seen. Keeps the state of the signals and the pack's identity.
+    /// Forgets the values that are valid only in the present run: the candidate for the pack's identity, and whether a
+    /// usable reading or a second sender was seen. Keeps the state of the signals and the pack's identity.
     pub(crate) fn restart(&mut self) {
         self.identity.candidate = None;
         (self.has_usable_reading, self.has_second_sender) = (false, false);

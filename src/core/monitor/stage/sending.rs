@@ -61,8 +61,8 @@ pub(crate) struct SendingState {
 }
 
 impl SendingState {
-    /// Drops everything that ends with the process: a test, diagnostic requests and the J1939 address. Standby and the
-    /// silence after another tester remain.
+    /// Drops everything that ends with the process: a test, diagnostic requests and the J1939 address. For the
+    /// diagnostic requests, standby remains, and so does the silence after requests of another tester.
     pub(crate) fn restart(&mut self, now: Timestamp) {
         (self.test, self.node) = (None, None);
         self.poller.take_if(|poller| !poller.restart(now));
@@ -110,7 +110,8 @@ impl Sending {
         }
     }
 
-    /// Restores what remains of the diagnostic requests after a restart. `taken`: time of the stored state.
+    /// Restores the standby of the diagnostic requests, and their silence after requests of another tester. `taken`:
+    /// time of the stored state.
     pub(crate) fn restore_silence(&mut self, state: &SendingState, taken: Timestamp, now: Timestamp) {
         if let (Some(poller), Some(stored)) = (&mut self.poller, &state.poller) {
             poller.restore_silence(stored, taken, now);
@@ -169,8 +170,8 @@ impl Sending {
         }
     }
 
-    /// Makes housekeeping due now. After a restart, all values are unknown, so they must be compared with the rules
-    /// before a frame is sent.
+    /// Makes housekeeping (the checks that depend only on time) due now. After a restart, all values are unknown, so
+    /// they must be compared with the rules before a frame is sent.
     pub(crate) fn compare_first(&mut self, now: Timestamp) {
         self.schedule.housekeeping = self.schedule.housekeeping.min(now);
     }
@@ -265,7 +266,8 @@ impl Sending {
         self.config.as_ref().is_some_and(is_sent) && self.schedule.take_freshness_due(now)
     }
 
-    /// Announces the freshness that commands may use next. `bus`: interface on which commands are received.
+    /// Announces the freshness (the counter of authenticated frames, as in AUTOSAR SecOC) that commands may use next.
+    /// `bus`: interface on which commands are received.
     pub(crate) fn send_freshness(&mut self, time: Timestamp, bus: Option<BusIndex>, freshness: u64, out: &mut Outputs) {
         let Some(output) = &self.config else { return };
         let secoc = output.plan.authentication(LayoutMessage::Freshness);
@@ -287,7 +289,7 @@ impl Sending {
         }
     }
 
-    /// Sends the next unknown alarm, and queues the alarms that are known again.
+    /// Sends the next alarm whose state is unknown, and queues the alarms whose state is known again.
     pub(crate) fn send_unknown_alarm(&mut self, now: Timestamp, engine: &AlarmEngine, out: &mut Outputs) {
         let turn = self.schedule.alarm_turn;
         self.schedule.alarm_turn = turn.wrapping_add(1);
@@ -302,7 +304,7 @@ impl Sending {
         if self.schedule.is_quiet {
             self.schedule.alarms.skip_turns(now, engine, period_s);
         }
-        // The loop ends when the budget is used up.
+        // The loop ends when no alarm is due or the budget of alarm frames is used up.
         while let Some(key) = self.schedule.alarms.take(now, engine, period_s) {
             self.send_key(now, key, engine, out);
         }
@@ -316,8 +318,8 @@ impl Sending {
         }
     }
 
-    /// Sends the present state of changed alarms within the budget. The remaining alarms and the repetitions follow
-    /// later.
+    /// Sends the present state of changed alarms, as far as the budget of alarm frames allows. The remaining alarms and
+    /// the repetitions follow later.
     pub(crate) fn send_changed_alarms(&mut self, now: Timestamp, engine: &AlarmEngine, out: &mut Outputs) {
         while let Some(key) = self.schedule.alarms.take_changed(now) {
             self.send_key(now, key, engine, out);

@@ -73,7 +73,7 @@ impl VoltageCounts {
     }
 }
 
-/// Numbers of half-cycles and of their results.
+/// Numbers of half-cycles (charges and discharges) and of their results.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct LearningCounts {
     /// Half-cycles, summed over the cells.
@@ -82,7 +82,7 @@ pub struct LearningCounts {
     pub capacity_updates: u64,
     /// Updates of a capacity filter that used a measurement.
     pub capacity_measurements: u64,
-    /// Recharge periods recorded, raw or normalised.
+    /// Number of recorded recharge periods, raw or normalised (see [`crate::health::recharge`]).
     pub recharge_periods: u64,
 }
 

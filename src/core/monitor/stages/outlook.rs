@@ -1,5 +1,5 @@
 //! Remaining energy, time to empty or full, and available power of the pack. These values are computed on demand from
-//! the states of the stages.
+//! the states of the monitor's stages (sampling, estimation, learning).
 
 use super::{EventKind, Stages};
 use crate::cell::{ModelBands, arrhenius};
@@ -66,8 +66,8 @@ impl Stages {
     pub(crate) fn cell_state(&self, index: usize) -> Option<CellNow<'_>> {
         let bank = &self.estimation.bank;
         let (soc, temperature_c, estimator) = (bank.soc(index)?, bank.temperature_c(index)?, bank.cell(index));
-        // The filter learns one resistance ratio for all SOC values and temperatures. The model's error at this SOC and
-        // temperature remains.
+        // The filter learns one resistance ratio for all SOC values and temperatures. `local` is the remaining error of
+        // the model at this SOC and temperature.
         let local = ModelBands::new(bank.model(index)).resistance(soc.mean, temperature_c).local;
         let of_cell = estimator.log_resistance();
         // Outside its temperature table, the model uses the resistance at the nearest tabulated temperature. `outside`

@@ -1,12 +1,13 @@
 //! Stores the learned values of disconnected packs by pack number, and returns them when a pack is connected again.
 //!
-//! If a reading shows another pack number, the learned values of the connected pack are put aside. Once the new number
-//! is confirmed, the values put aside are stored, and the stored values of the new pack are returned if there are any.
+//! If a reading shows another pack number, the learned values of the connected pack are put aside. When further
+//! readings confirm the new number, the values that were put aside are stored. If values of the new pack are stored,
+//! they are returned.
 //!
 //! The stored values are the cell model, capacities, resistances, remaining lives, recharge periods, findings and the
-//! current offset (a pack often has its own sensor). The unfinished half-cycle and the state of charge are not stored;
-//! the first voltage determines the state of charge. A pack without learned values is not stored, so that bogus pack
-//! numbers do not displace real packs.
+//! offset of the current sensor (a pack often has its own sensor). The unfinished half-cycle (charge or discharge) and
+//! the state of charge are not stored; the first voltage determines the state of charge. A pack without learned values
+//! is not stored, so that bogus pack numbers do not displace real packs.
 
 use serde::{Deserialize, Serialize};
 
@@ -18,7 +19,7 @@ use crate::monitor::stage::learning::{CellHealth, LearningState, Throughput, che
 use crate::monitor::stage::modelling::ModellingState;
 use crate::quantity::{InvalidState, bounds};
 
-/// Maximum number of stored packs, not counting the connected pack. A vehicle alternates between fewer packs.
+/// Maximum number of stored packs, not counting the connected pack. Vehicles alternate between fewer packs than this.
 const MAX_PACKS: usize = 8;
 /// Maximum number of cells in all stored packs together. One pack is stored even if it has more cells. A cell takes
 /// 2.6 kB of the stored state.
@@ -67,12 +68,14 @@ impl PackMemory {
         self.aside = Some(Box::new(pack));
     }
 
-    /// Drops the values put aside. Called if the old number was read again, or if the learned values no longer apply.
+    /// Drops the values that were put aside. Called if the old number was read again, or if the learned values no
+    /// longer apply.
     pub(crate) fn drop_aside(&mut self) {
         self.aside = None;
     }
 
-    /// Stores the pack that was put aside. Removes the stored pack with `number` and returns it.
+    /// Stores the pack that was put aside. If a pack with `number` is stored, removes it from the memory and returns
+    /// it.
     pub(crate) fn exchange(&mut self, number: f64) -> Option<StoredPack> {
         let found = self.packs.iter().position(|pack| pack.number == number).map(|place| self.packs.remove(place));
         if let Some(pack) = self.aside.take().filter(|pack| pack.has_learned()) {
@@ -147,8 +150,8 @@ impl StoredCell {
         bounds::TIME_S.check("the unmeasured time used by a cell's filter", unmeasured_s)
     }
 
-    /// Whether the stored filter has as many RC branches as the bank's model of this cell. A cell of a module always
-    /// fits, because the module may have been replaced.
+    /// Whether the stored filter has as many RC branches as the bank's model of this cell. A cell of a module (cells of
+    /// another type in the pack) always fits: another number of branches only means that the module was replaced.
     pub(crate) fn fits(&self, bank: &PackBank, index: usize) -> bool {
         !bank.is_own(index) || CellEstimator::restore(&self.estimator, bank.model(index).branches.len()).is_some()
     }

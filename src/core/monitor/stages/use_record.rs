@@ -1,7 +1,7 @@
 //! Passes the pack's values to the record of use (counters of how the pack was used), every 0.1 s while the buses are
 //! not silent.
 //!
-//! While the current is doubtful, current and SOC are passed as unknown. While an input message has a second sender,
+//! While the current is doubtful, current and SOC are passed as unknown. While two nodes send the same input message,
 //! all values are passed as unknown. The limits come from `[outlook]`. If `[outlook]` has no voltage limits, the widest
 //! limits of the cell models apply.
 

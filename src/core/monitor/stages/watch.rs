@@ -1,8 +1,9 @@
 //! Passes measured and estimated values to their alarm rules every 0.1 s. The learning stage passes the learned values.
 //!
-//! In: the states of all stages. Out: values for the [alarming](crate::monitor::stage::alarming) stage. If a part of a
-//! value is unknown, the value is passed as a bound, which can raise an alarm but not clear one. Fast path: if the
-//! worst value trips no threshold, the other values are only refreshed for display, once a second.
+//! In: the states of all stages. Out: values for the [alarming](crate::monitor::stage::alarming) stage. If a value
+//! combines several inputs or cells and some of them are unknown, the value is passed as a bound. A bound can raise an
+//! alarm but not clear one. Fast path: if the worst value trips no threshold, the other values are only refreshed for
+//! display, once a second.
 
 use super::Stages;
 use crate::alarm::{AlarmInput, Observation, Rule};
@@ -71,7 +72,7 @@ impl Stages {
         }
     }
 
-    /// Passes the evidence of a thermal event of every cell to its rule, every half minute.
+    /// Passes each cell's evidence of a thermal event to the rule, every half minute.
     fn refresh_thermal(&mut self, now: Timestamp, out: &mut Outputs) {
         for (cell, evidence) in self.findings.refresh_thermal(now, (&self.sampling, &self.estimation)) {
             self.publisher(now, out).observe(Rule::ThermalEvent, Some(cell), Observation::new(evidence));
@@ -116,8 +117,8 @@ impl Stages {
         }
         if let Some(mut pack) = pack {
             if has_second_sender {
-                // With a second sender, a reading may come from a node other than the sensor, so no reading counts as
-                // good.
+                // If a second node sends a message of the pack, a reading may come from the wrong node, so no reading
+                // counts as good.
                 pack.bad_share = Observation::new(Some(1.0));
             }
             self.observe_input(now, None, pack, out);

@@ -37,7 +37,7 @@ impl SensorRange {
 impl Sampler {
     /// Time since the channel's latest reading, good or bad (s), for the rule `input_missing`.
     pub fn silence_s(&self, channel: Channel, now: Timestamp) -> Option<f64> {
-        // Use the later of the two times, because time before the start or the last waking does not count.
+        // Use the later of the two times, because time before the start or before the vehicle last woke does not count.
         let since = self.state.signals[self.slot(channel)?].received.max(self.state.began);
         Some(since.map_or(0.0, |from| now.since(from).max(0.0)))
     }

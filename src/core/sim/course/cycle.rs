@@ -5,7 +5,7 @@ use crate::sim::noise::Noise;
 use crate::sim::scenario::Settings;
 use crate::sim::truth::Pack;
 
-/// Range of the discharge pulses (A) for a cell of 30 Ah. They are uniformly distributed.
+/// Range of the pulse currents (A) for a cell of 30 Ah. The currents are uniformly distributed.
 const PULSE_A: (f64, f64) = (0.0, 30.0);
 const PULSE_S: f64 = 60.0;
 
@@ -54,7 +54,8 @@ pub(crate) struct CycleCourse {
 
 impl CycleCourse {
     pub(super) fn paper(settings: &Settings, scale: f64) -> Self {
-        // Current in both directions (A) for a cell of 2.6 Ah. 48 cycles then take 2.23e5 s, as in the paper.
+        // Current in both directions (A) for a cell of 2.6 Ah. 48 cycles then take 2.23e5 s, as in "Battery Predictions
+        // for Electronic Prognostics", whose cycles the scenario `paper` repeats.
         let current_a = 1.325 * scale;
         Self::new(settings, Load::Constant { current_a }, current_a)
     }

@@ -1,5 +1,5 @@
-//! Computes the current of the scenario `random-walk`: 5-minute loads of random current within voltage limits, with
-//! reference cycles in between.
+//! Computes the current of the scenario `random-walk`: blocks of 5-minute loads of random current within voltage
+//! limits. After each block, reference cycles (a full charge and a full discharge) follow.
 
 use super::demand::Demand;
 use crate::sim::noise::Noise;

@@ -111,7 +111,8 @@ fn sleeping_bms_reports_bits_while_bleeding() {
     (settings.cycles, settings.duration_s) = (Some(2), Some(100_000.0));
     (settings.current_period_ns, settings.cell_period_ns) = (1_000_000_000, 1_000_000_000);
     let mut nights = 0;
-    // With some seeds, the car stops on the drive home. This stop counts as the rest after the charge.
+    // With some seeds, the car stops on the drive home. This stop counts as the rest after the charge, so no cell is
+    // bled at night. Therefore, several seeds are simulated.
     for seed in 1..=20 {
         settings.seed = seed;
         let run = |has_bits: bool| {

@@ -3,9 +3,9 @@
 //!
 //! | file | purpose |
 //! | --- | --- |
-//! | `label` | names and units: points for each quantity of a pack |
+//! | `label` | names and units of signals: points for each quantity of a pack that a signal may be |
 //! | `series` | statistics of one signal: counts, periods, extent, roughness |
-//! | `sample` | extent and thinned sample of a stream |
+//! | `sample` | extent of a stream of values, and every n-th value of it |
 //! | `layout` | a signal read with another byte order, start bit or sign |
 //! | `loss` | frames missing from a cyclic signal |
 //! | `slope` | voltage over current: sign and size of the resistance |

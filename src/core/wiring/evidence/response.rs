@@ -257,8 +257,8 @@ impl VoltageResponse {
         self.slope_over(|step| step.cells_v.get(cell).map(|v| f64::from(*v)))
     }
 
-    /// Slope from the current steps that are at least a fifth of the largest step, because smaller steps are mostly
-    /// noise. If there are fewer than five such steps, all steps are used, because the small steps show the noise.
+    /// Slope from the large current steps (at least a fifth of the largest step), because smaller steps are mostly
+    /// noise. If there are fewer than five large steps, all steps are used, so that the small steps show the noise.
     fn slope_over(&self, voltage_v: impl Fn(&CurrentStep) -> Option<f64>) -> Option<Slope> {
         let largest = self.steps.iter().map(|step| step.current_a.abs()).fold(0.0, f64::max);
         // A charger with constant power or a tapering current lowers the current slowly as the voltage rises. Then
@@ -274,8 +274,8 @@ impl VoltageResponse {
             return Slope::of(points(0.2 * largest));
         }
         let all: Vec<(f64, f64)> = points(0.0).collect();
-        // Exception: if the largest step is small for this pack, the steps are noise or in a wrong unit. Then use
-        // only the steps that are at least a fifth of the largest step, without outliers.
+        // Exception: if even the largest step is small for this pack, the steps are noise or the unit is wrong. In this
+        // case, only the large steps are used, without outliers.
         if largest < 5.0 * self.tolerance_a { Slope::of(points(0.2 * largest)) } else { Slope::fit(&all) }
     }
 

@@ -1,4 +1,4 @@
-//! Statistics of one signal: counts, periods, extent and roughness of its values. The extent is also kept for
+//! Statistics of one signal: counts, periods, and the range and the changes of its values. The range is also kept for
 //! alternative layouts of the signal (byte order, start bit, sign).
 //!
 //! In: payloads or values with their time. Values are in the program's unit, after the configured scale and offset,
@@ -34,7 +34,7 @@ pub struct Series {
     /// Number of values outside `plausible`.
     pub(crate) implausible: u64,
     plausible: Option<(f64, f64)>,
-    /// Extent of all values.
+    /// Smallest, largest and latest value, and the number of values.
     pub extent: Extent,
     /// A sample of the values.
     pub values: ThinnedSample,
@@ -80,7 +80,7 @@ impl Series {
     pub fn of(readings: impl Iterator<Item = (f64, Result<f64, Fault>)>) -> Self {
         // 4096 values suffice for a correlation. Samples of this size fit into memory for thousands of signals.
         const MOST: usize = 4096;
-        // Short enough to show the load changes, which take some tenths of a second.
+        // One reading per 0.5 s is enough to show load changes, which take some tenths of a second.
         const FINE_S: f64 = 0.5;
         let mut series = Self::default();
         let mut all = Vec::new();
@@ -223,8 +223,8 @@ impl Series {
         5 * most > 3 * values.len().saturating_sub(1).min(200)
     }
 
-    /// The raw code that means zero. This is 0, or a usual offset if the values never come near zero. `None` if no
-    /// usual offset lies among or near the codes. `factor`: value per code.
+    /// Returns the raw code that means zero. If the received codes come near 0, this is 0. Otherwise, it is a usual
+    /// offset in or near the range of the received codes; `None` if there is no such offset. `factor`: value per code.
     pub fn zero_code(&self, factor: f64) -> Option<f64> {
         let (low, high) = (self.extent.min / factor, self.extent.max / factor);
         if low - 3.0 * (high - low) <= 0.0 {
@@ -234,7 +234,8 @@ impl Series {
         let powers = [32_768.0, 32_767.0, 2048.0, 32_000.0].into_iter();
         let round =
             [10_000.0, 5000.0, 1000.0, 500.0, 100.0].into_iter().map(|step| (0.5 * (low + high) / step).round() * step);
-        // If the pack was only discharged, zero lies outside the codes. Therefore widen the range.
+        // If the pack was only discharged, the code for zero lies outside the received range. Therefore widen the
+        // range.
         let (low, high) = (2.0 * low - high, 2.0 * high - low);
         powers.chain(round).find(|zero| *zero > 0.0 && (low..=high).contains(zero))
     }
@@ -245,9 +246,10 @@ impl Series {
     }
 }
 
-/// Thins readings to at most `most`. First, fast readings are thinned to one per `fine_s` (s). Then whole windows of
-/// time are kept. The sample therefore contains the steps from reading to reading even for a long log, and all
-/// signals keep the same times.
+/// Thins readings to at most `most`. First, fast readings are thinned to one per `fine_s` (s). If that is not enough,
+/// whole windows of time are kept and the readings between them are dropped. Even for a long log, the sample therefore
+/// contains steps between consecutive readings. The windows depend only on the time, so all signals keep the same
+/// times.
 pub fn windows<T>(mut readings: Vec<(f64, T)>, most: usize, fine_s: f64) -> Vec<(f64, T)> {
     // This is longer than the period of most signals, and short enough that fast signals keep many windows.
     let window_s = 16.0 * fine_s;

@@ -122,7 +122,8 @@ impl UsageRecord {
 /// Charge per reported state of charge, fitted over all stretches.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct ChargeSlope {
-    /// Charge (Ah) drawn while the reported state of charge falls from 1 to 0; negative if it rises instead.
+    /// Charge (Ah) drawn while the reported state of charge falls from 1 to 0; negative if the reported state of charge
+    /// rises during a discharge.
     pub(crate) capacity_ah: f64,
     /// Share of the variance that a common slope of all stretches explains, 0 to 1.
     pub(crate) r2: f64,
@@ -137,8 +138,8 @@ pub(crate) struct ChargeSlope {
     pub(crate) charge_range_ah: f64,
 }
 
-/// Pairs of charge (Ah) and reported state of charge, for each stretch. A stretch is split where the controller
-/// corrects its value, that is, where the value jumps much further than the charge.
+/// Pairs of charge (Ah) and reported state of charge, for each stretch. Where the pack's controller corrects the
+/// reported value, the value jumps much further than the charge, and the stretch is split.
 fn stretches(moments: &[Moment], place: usize) -> Vec<Vec<(f64, f64)>> {
     /// Maximum number of corrections. If there are more jumps, they are the steps of a value that is sent rarely, and
     /// the stretch is not split.

@@ -1,4 +1,5 @@
-//! State that all checks share: the collected data, the plan, the unfinished report, and the unit factors found.
+//! State that all checks of `doctor` share: the collected data, the plan (what is expected), the unfinished report, and
+//! the unit factors that were found.
 
 use std::collections::BTreeSet;
 
@@ -14,8 +15,8 @@ use crate::wiring::report::{Severity, Topic, WiringFinding, WiringReport};
 /// Largest plausible current of a pack, in multiples of the pack's capacity per hour.
 pub(super) const MAX_C_RATE: f64 = 30.0;
 
-/// The size of a slope is judged only if the current explains at least this share of the voltage's changes. If the
-/// current explains less, the noise of the current makes the slope too small.
+/// The size of the voltage's slope against the current is judged only if the current explains at least this share of
+/// the voltage changes. If the current explains less, the noise of the current makes the slope too small.
 pub(super) const EXPLAINED: f64 = 0.8;
 
 /// A configured signal with the statistics of its values.
@@ -113,7 +114,8 @@ impl<'d> Judge<'d> {
 
     /// Smallest and largest voltage that the median cell may have (V).
     pub(super) fn voltage_band(&self) -> (f64, f64) {
-        // The limits can be narrow, because short peaks do not change a median over time.
+        // The limits can be close to the voltage limits of the cell, because short peaks do not change a median over
+        // time.
         self.plan.pack.model.as_ref().map_or((1.2, 4.6), |m| (m.voltage_min_v - 0.15, m.voltage_max_v + 0.08))
     }
 

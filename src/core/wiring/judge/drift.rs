@@ -7,14 +7,14 @@ use crate::wiring::evidence::response::SteadyRun;
 /// A drift counts only if it is at least this many standard deviations from zero.
 const SURE: f64 = 6.0;
 
-/// Voltage drift during all steady runs together, per cell.
+/// Voltage drift over all steady runs (periods of steady current) together, as the voltage of one cell.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Drift {
     pub(super) seconds: f64,
     /// Sum of the absolute drifts that the model expects (V).
     pub(super) expected_v: f64,
-    /// Mean measured drift of a run, weighted by the expected drift (V, absolute value). The finding of an inverted
-    /// current shows this value.
+    /// Absolute value of the mean measured drift of a run, weighted by the expected drift (V). If the current seems to
+    /// be inverted, the report shows this value.
     pub(super) against_v: f64,
     /// Ratio of measured to expected drift, weighted by the expected drift.
     pub(super) ratio: f64,
@@ -22,8 +22,8 @@ pub(super) struct Drift {
 }
 
 impl Drift {
-    /// Drift over the steady runs of the short blocks; `None` without a cell model, or if the model expects no drift
-    /// in any run.
+    /// Drift over the steady runs that were found with short averaging blocks. `None` without a cell model, or if the
+    /// model expects no drift in any run.
     pub(super) fn of(judge: &Judge<'_>) -> Option<Self> {
         let model = judge.plan.pack.model.as_ref()?;
         let (mut xx, mut xy, mut variance, mut seconds, mut expected_v) = (0.0, 0.0, 0.0, 0.0, 0.0);

@@ -65,7 +65,8 @@ pub(super) fn is_inverted(judge: &Judge<'_>) -> bool {
     cell_slope(judge).is_some_and(|slope| slope.certainty() >= 1.0 && slope.r2 >= 0.2 && slope.ohm < 0.0)
 }
 
-/// The pack's slope in ohm per cell, corrected for the unit factors found and for parallel strings.
+/// Slope of the voltage against the current, in ohm per cell. It is corrected for wrong units that `doctor` has found,
+/// and for parallel strings.
 fn cell_slope(judge: &Judge<'_>) -> Option<Slope> {
     let slope = judge.observed.slope()?;
     let by = judge.voltage_factor / judge.current_factor * f64::from(judge.plan.pack.strings.max(1));

@@ -97,9 +97,9 @@ pub(super) fn check_stopped(judge: &mut Judge<'_>) {
         .advice("the sensor or its sender fails in this time; estimates do not know the charge that flows");
 }
 
-/// Describes how the voltages or the reported state of charge (at `place`) show that a current flows; `None` if they
-/// do not. Two changes do not count. A resting voltage relaxes in one direction. A controller corrects its state of
-/// charge by a jump, or by less than its largest error.
+/// Describes how the voltages or the reported state of charge (at `place`) show that a current flows; `None` if they do
+/// not. Two kinds of change do not show a current. A resting voltage relaxes in one direction. A controller corrects
+/// its state of charge in one jump, or by less than [`HIDDEN_SOC`].
 fn movement(run: &[Moment], place: Option<usize>, least_v: f64) -> Option<String> {
     let steps = |sign: f64| run.windows(2).filter(|p| sign * (p[1].voltage_v - p[0].voltage_v) > least_v).count();
     let socs: Vec<f64> = place.map_or_else(Vec::new, |at| run.iter().map(|moment| moment.reported[at]).collect());
@@ -128,12 +128,13 @@ pub(super) fn check_equal(judge: &mut Judge<'_>) {
             .change(&signal.table, "signal", "a pattern that gives each cell its own signal")
             .advice("compare the start bits in the DBC with the sender's documentation");
     }
-    // With a coarse resolution, different cells often agree.
+    // With a coarse resolution, the voltages of different cells are often equal, so they are not compared.
     let step_v = |(signal, _): &SignalSeries<'_>| (signal.layout.factor * signal.scale).abs() * judge.voltage_factor;
     if voltages.iter().any(|voltage| step_v(voltage) > 0.005) {
         return;
     }
-    // Only blocks in which the voltages changed count, because similar cells may agree for a while.
+    // Only blocks of readings in which the voltages changed are counted, because the voltages of similar cells may be
+    // equal for a while.
     let [fast, slow] = judge.observed.responses().each_ref().map(|response| response.equal_cells.groups(25));
     for (cells, blocks) in if fast.is_empty() { slow } else { fast } {
         let is_member = |(signal, _): &&SignalSeries<'_>| matches!(signal.binding.channel, Channel::CellVoltage(cell) if cells.contains(&cell.index()));

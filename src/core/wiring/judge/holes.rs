@@ -51,8 +51,8 @@ fn use_in(judge: &Judge<'_>, hole: &Hole) -> Option<String> {
     use_between(judge, before, &moments[moments.partition_point(|moment| moment.time < hole.to)..])
 }
 
-/// As [`use_in`], with the last moment before and the moments after a missing stretch. Small changes do not count,
-/// because a parked pack feeds small loads and its controller corrects the state of charge by some per cent.
+/// Like [`use_in`], but takes the last moment before a missing stretch and the moments after it. Small changes do not
+/// count, because a parked pack feeds small loads and its controller corrects the state of charge by some per cent.
 fn use_between(judge: &Judge<'_>, before: &Moment, after: &[Moment]) -> Option<String> {
     /// Minimum mean current that shows use, in multiples of the capacity per hour.
     const LEAST_RATE: f64 = 0.1;

@@ -78,8 +78,8 @@ fn open_circuit(judge: &mut Judge<'_>, model: &CellModel, drift: Option<Drift>) 
 }
 
 /// Whether the voltage is above the model's curve only because a charger holds it there. True if the pack is hardly
-/// discharged at these voltages and reports that it is full. If it reports no state of charge, the first voltage must
-/// not be above the curve.
+/// discharged at these voltages, and reports that it is full. If the pack reports no state of charge, the first voltage
+/// of the record must not be above the curve, so that the voltage was raised by a charge within the record.
 fn is_held_full(judge: &Judge<'_>, estimates: &[OcvEstimate], full_v: f64) -> bool {
     let is_above = |estimate: &&OcvEstimate| estimate.voltage_v - estimate.slack_v > full_v;
     let above: Vec<&OcvEstimate> = estimates.iter().filter(is_above).collect();

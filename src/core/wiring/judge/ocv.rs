@@ -1,8 +1,8 @@
 //! Estimates the open-circuit voltage of the median cell during use, by correcting the voltage for the current.
 //!
 //! The correction uses the measured resistance if the current steps show it, otherwise the resistance of the cell
-//! model. Each estimate has a slack. It covers half of the correction, the spread of the curves of one chemistry, and
-//! hysteresis.
+//! model. Each estimate has a slack (its largest error). The slack covers half of the correction, the spread of the
+//! curves of one chemistry, and hysteresis.
 
 use super::context::{EXPLAINED, Judge};
 use crate::wiring::evidence::usage::MAX_REPORTED;
@@ -45,8 +45,9 @@ pub(super) fn estimates(judge: &Judge<'_>) -> Vec<OcvEstimate> {
     judge.observed.usage.moments().iter().map(estimate).collect()
 }
 
-/// Whether the state of charge that the voltages show rises (`is_rise`) or falls (not `is_rise`) by more than the
-/// errors of the estimates explain. The caller calls this function if the current has only the opposite sign.
+/// Whether the voltages show that the state of charge rises (with `is_rise`) or falls (without `is_rise`), by more than
+/// the errors of the estimates can explain. If a current always has the same sign although the state of charge has
+/// risen and fallen, its sign is missing.
 pub(super) fn moves_against(judge: &Judge<'_>, is_rise: bool) -> bool {
     const LEAST: f64 = 0.05;
     let Some(model) = &judge.plan.pack.model else { return false };

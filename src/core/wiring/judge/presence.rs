@@ -69,9 +69,9 @@ fn cell_number(signal: &SignalPlan) -> Option<u16> {
     if let Channel::CellVoltage(cell) = signal.binding.channel { Some(cell.0) } else { None }
 }
 
-/// If exactly the last cells are absent, reports that too many cells are configured. Returns the signals that are
-/// still to be reported. They include the absent cells if the last module may be dead: the message was not received,
-/// or its values are "not available".
+/// If exactly the last cells are absent, reports that too many cells are configured. Returns the absent signals that
+/// are still to be reported. The last module may have failed if its message was not received or its values are "not
+/// available". The absent cells are then also returned.
 fn fewer_cells<'d>(judge: &mut Judge<'d>, absent: Vec<Absent<'d>>) -> Vec<Absent<'d>> {
     let mut cells: Vec<u16> = absent.iter().filter_map(|(signal, _)| cell_number(signal)).collect();
     cells.sort_unstable();
@@ -106,7 +106,7 @@ fn reason_for_cells(absence: Absence) -> &'static str {
     }
 }
 
-/// Reports absent signals, one finding per message and reason.
+/// Reports absent signals. Signals of the same message that are absent for the same reason share one finding.
 fn silent(judge: &mut Judge<'_>, absent: &[Absent<'_>]) {
     let mut groups: BTreeMap<(BusIndex, &str, Absence), Vec<&SignalPlan>> = BTreeMap::new();
     for (signal, absence) in absent {

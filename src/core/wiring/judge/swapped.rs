@@ -117,7 +117,7 @@ struct Fit {
 
 fn fit(judge: &Judge<'_>, series: &Series) -> Option<Fit> {
     let (low, high) = series.values.bulk()?;
-    // If a voltage is configured as the current, the current's sign may make the voltage negative.
+    // If a voltage is configured as the current, the configured sign of the current may have made it negative.
     let (low, high) = if high <= 0.0 { (-high, -low) } else { (low, high) };
     let (band, cells) = (judge.voltage_band(), judge.cells_per_reading());
     let is_slow = series.changes.median().unwrap_or(0.0) < 1.0 && high - low < 40.0;
@@ -187,7 +187,7 @@ fn odd_cells(judge: &mut Judge<'_>) {
 
 fn odd_sensors(judge: &mut Judge<'_>) {
     let sensors = judge.signals(Kind::Temperature);
-    // `values` reports the sensors with impossible values.
+    // The module `values` reports the sensors with impossible values.
     let possible = |series: &Series| series.values.median().filter(|_| !is_impossible(series));
     let median_c = judge.median_of(Kind::Temperature, possible);
     let Some(median_c) = median_c.filter(|_| sensors.len() >= 4 && judge.cell_voltage().is_some()) else { return };

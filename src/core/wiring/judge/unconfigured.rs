@@ -8,7 +8,7 @@ use crate::wiring::evidence::HIDDEN_SOC;
 use crate::wiring::plan::Kind;
 use crate::wiring::report::{Severity, Topic};
 
-/// Maximum deviation of the sum of the cell voltages from the pack's voltage that sensor errors explain, fraction.
+/// Because of sensor errors, the sum of the cell voltages can differ from the pack's voltage by at most this fraction.
 const SUM_TOLERANCE: f64 = 0.03;
 /// Maximum difference between two states of charge that agree.
 const AGREEMENT: f64 = 0.03;

@@ -18,7 +18,7 @@ const UNIT_FACTORS: [f64; 6] = [1e-3, 1e-2, 1e-1, 10.0, 100.0, 1000.0];
 const PLAUSIBLE_C: std::ops::RangeInclusive<f64> = -40.0..=60.0;
 /// Possible temperatures of a pack, even on fire or in extreme cold (degrees C).
 const POSSIBLE_C: std::ops::RangeInclusive<f64> = -60.0..=120.0;
-/// Maximum share of implausible readings that single disturbances explain.
+/// Single disturbances can make up to this share of the readings implausible. A larger share has another cause.
 const MANY: f64 = 0.01;
 
 pub(super) fn check(judge: &mut Judge<'_>) {
@@ -229,8 +229,8 @@ fn missing_offset(judge: &mut Judge<'_>, (signal, series): &SignalSeries<'_>) ->
     let on_bus =
         Series::of(series.values.kept().iter().zip(0_u32..).map(|(value, n)| (f64::from(n), Ok(sign * value))));
     let (low, high) = (on_bus.extent.min, on_bus.extent.max);
-    // Zero lies among the values, because a pack rests, or is charged and discharged. A wrong factor explains other
-    // values.
+    // The code for 0 A lies among the values, because a pack rests, or is both charged and discharged. If the code lies
+    // outside the values, a wrong factor is more likely than a missing offset.
     let is_among = |zero: &f64| *zero != 0.0 && (low..=high).contains(&(zero * factor));
     let Some(zero) = on_bus.zero_code(factor).filter(|zero| low > STEADY_A && is_among(zero)) else { return false };
     judge.is_mixed_up = true;
@@ -309,7 +309,7 @@ fn wrong_temperature(
             .change(&all[0].0.table, "signal", "a temperature");
         return;
     };
-    // A pack in danger may have such temperatures.
+    // 60 to 90 degrees C are possible if the pack is in danger.
     let (severity, hint) = match (60.0..90.0).contains(&median_c) {
         true => (Severity::Warning, "a pack this hot would be in danger"),
         false => (Severity::Error, "impossible for a pack"),

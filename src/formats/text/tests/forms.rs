@@ -154,7 +154,8 @@ fn trc_fd_lengths_are_codes_or_bytes() {
 
 #[test]
 fn trc_start_time_is_exact_to_its_resolution() {
-    // Microseconds with the digits that python-can writes; milliseconds with the ten digits of PEAK's tools.
+    // Start times in days. python-can writes enough digits for microseconds. PEAK's tools write ten decimals, which are
+    // enough for milliseconds.
     let cases = [
         ("45244.92592592593", "1700000000"),
         ("45244.92592739403", "1700000000.126844"),

@@ -1,4 +1,4 @@
-//! Tests that the same frames give the same items in every format.
+//! Tests that the same frames are read as the same items from a log of every text format.
 
 use packwatch_core::can::{CanId, Frame};
 use packwatch_core::quantity::Timestamp;
@@ -9,7 +9,7 @@ use crate::Item;
 /// Start of the logs, 14 November 2023 22:13:20 UTC.
 const START_US: i64 = 1_700_000_000_000_000;
 
-/// Frames with their time since the start in us. Times and contents differ in every digit.
+/// Frames with their time since the start in us. Times and contents are random, so that every digit varies.
 fn frames() -> Vec<(i64, Frame)> {
     let mut seed = 1_u64;
     let mut next = move || {

@@ -1,5 +1,5 @@
 //! Makes a cell model from the label of a cell (chemistry, rated capacity, voltages), for cells without a model file.
-//! On board, learning then improves this model.
+//! The daemon in the vehicle then improves this model by learning.
 
 use super::source::{LearnedFrom, MeasuredRange, ModelSource, SourcedModel};
 use crate::cell::{Coverage, FleetPrior, Label};
@@ -18,8 +18,8 @@ pub fn of_label(label: &Label) -> Option<SourcedModel> {
     label.model().map(|model| SourcedModel { model, source })
 }
 
-/// Returns the initial model of a vehicle with a fleet prior. `None` = the voltages are not plausible for the
-/// chemistry.
+/// Returns the initial model of a vehicle that starts from a fleet prior (what other vehicles have learned about such
+/// cells). `None` = the voltages are not plausible for the chemistry.
 pub fn of_fleet(prior: FleetPrior) -> Option<SourcedModel> {
     let SourcedModel { source, .. } = of_label(&prior.label)?;
     let origin = format!("learned by {} other vehicles with cells of this label", prior.vehicles);

@@ -42,9 +42,10 @@ pub struct ModelSource {
     pub measured: MeasuredRange,
     /// `[provenance]` of the file; empty if not given.
     pub provenance: Table,
-    /// For a model that is learned on board: the label's model, and the data behind the learned values.
+    /// For a model that is learned in the vehicle: the label's model, and the data behind the learned values.
     pub learned: Option<LearnedFrom>,
-    /// The fleet prior of the key `pack.prior`, if the model starts from it.
+    /// The fleet prior (what other vehicles have learned about such cells) of the key `pack.prior`, if the model starts
+    /// from it.
     pub fleet: Option<Box<FleetPrior>>,
 }
 
@@ -57,7 +58,8 @@ pub struct LearnedFrom {
     pub seen: Coverage,
     /// Root mean square of the residuals (V); `None` = nothing is learned yet.
     pub residual_v: Option<f64>,
-    /// A chemistry that explains the voltages better than the chemistry on the label.
+    /// A chemistry that explains the voltages better than the chemistry on the label; `None` = there is no such
+    /// chemistry.
     pub chemistry: Option<Chemistry>,
     /// Number of fits.
     pub fits: u32,
@@ -142,9 +144,9 @@ impl SourcedModel {
         self.by_prior(&std).unwrap_or_else(|| self.source.by_range(self.source.measured.temperature_c, temperature_c))
     }
 
-    /// If the model is learned on board, returns what a part of the model is based on; `None` for other models. `std`
-    /// computes the standard deviation of the part for a model. The result is `Data` if
-    /// `std(learned) <= 0.7 * std(label)`, else `Prior`.
+    /// If the model is learned in the vehicle, returns what one part of the model (curve or resistances) is based on.
+    /// Returns `None` for other models. `std` returns the standard deviation of this part in a given model. The result
+    /// is `Data` if `std(learned) <= 0.7 * std(label)`, else `Prior`.
     fn by_prior(&self, std: &dyn Fn(&CellModel) -> Option<f64>) -> Option<KnownBy> {
         let learned = self.source.learned.as_ref()?;
         let (left, before) = (std(&self.model)?, std(&learned.prior)?);

@@ -12,7 +12,8 @@ use crate::health::RechargeAlarm;
 pub(crate) struct RatedCell {
     /// Rated capacity (Ah).
     pub capacity_ah: f64,
-    /// Time in which the reference charger charges a cell of the rated capacity through the recharge window (s).
+    /// Time in which the reference charger charges a cell of the rated capacity through the recharge window (a
+    /// configured SOC range) (s).
     pub recharge_period_s: f64,
 }
 
@@ -132,8 +133,8 @@ pub(crate) fn check(raw: &RawTables, rated: Option<&RatedCell>) {
     }
 }
 
-/// Reports inputs and tables that the alarm's rule requires but the file does not contain. Also reports a key `when`
-/// that requires a standard deviation, if the rule's value has none.
+/// Reports inputs and tables that the alarm's rule requires but the file does not contain. If the key `when` requires a
+/// standard deviation and the rule's value has none, reports the key.
 fn check_needs(alarm: &Alarm, raw: &RawTables) {
     let cells = raw.pack.as_ref().map_or(2, |pack| if raw.is_pack_total() { 1 } else { pack.cells });
     let is_reported = raw.is_written::<ReportedSocInput>() || raw.is_written::<ReportedSohInput>();

@@ -1,5 +1,5 @@
-//! Checks the cells of the pack: the pack's own cells, described by a model file or a label, and modules of other cells
-//! (`[[pack.module]]`).
+//! Checks the cells of the pack: the pack's own cells, described by a model file or a label (chemistry and rated
+//! capacity), and modules with other cells (`[[pack.module]]`).
 //!
 //! In: the tables and the cell model files they name. Out: the models. Reports missing keys and keys that contradict
 //! each other. Reports cells of a module that do not exist, belong to two modules, or have no known type.
@@ -39,7 +39,8 @@ pub(crate) fn own_model(
     raw: &RawTables,
     read: ReadFile<'_>,
 ) -> Option<SourcedModel> {
-    // The key is read from the document, because `raw` has no pack if another key of the pack is faulty.
+    // The key is read from the document: if another key of the table `pack` is faulty, `raw` does not contain this
+    // table.
     let key = document.find("pack.cell_model");
     if let Some((key, named)) = key.and_then(|key| Some((key.span(), key.get_ref().as_str()?))) {
         return file_model(path, named, read, &raw.faults, |what| {

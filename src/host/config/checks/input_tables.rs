@@ -1,7 +1,7 @@
 //! Checks interface names and signal names in the input tables, even in a table that has another fault.
 //!
-//! The input is the document, because [`RawTables`] does not contain faulty tables. Their names must be checked too, so
-//! that every fault is reported at once.
+//! [`RawTables`] does not contain tables that have a fault. The names in these tables must be checked too, so that
+//! every fault is reported at once. These checks therefore read the TOML document.
 
 use std::collections::BTreeSet;
 

@@ -1,8 +1,9 @@
 //! Checks for settings that parse but cannot be intended. Examples: a signal extends beyond its message, two signals
 //! share bits, a unit is wrong, a range is empty, the capacity belongs to another cell.
 //!
-//! In: the tables, the signals found, the cell model. Out: faults for certain errors, warnings for unlikely values. A
-//! DBC unit that contradicts a configured `scale` or `offset` gives only a warning.
+//! In: the tables of the configuration, the signals that were found in the DBC files, the cell model. Out: faults for
+//! certain errors, warnings for unlikely values. If the unit in the DBC contradicts a configured `scale` or `offset`,
+//! the result is only a warning.
 
 use super::cells::Module;
 use super::signals::{self, ResolvedSignal};
@@ -16,7 +17,6 @@ use crate::quantity::{Channel, bounds};
 use crate::sample::Limits;
 
 /// Two cells count as different if the ratio of their rated capacities (larger over smaller) is at least this number.
-/// The estimator has the same limit for learned resistances relative to the model's resistances.
 const OTHER_CELL: f64 = 3.0;
 
 pub(crate) fn signals(raw: &RawTables, found: &[ResolvedSignal<'_>], model: Option<&CellModel>) {
@@ -33,8 +33,8 @@ pub(crate) fn signals(raw: &RawTables, found: &[ResolvedSignal<'_>], model: Opti
     overlaps(raw, found);
 }
 
-/// Range of values that can occur, in the channel's unit. A signal must be able to encode at least a part of this
-/// range. `None` = not checked.
+/// Range of the values that can occur on a channel, in the channel's unit. A signal must be able to encode at least a
+/// part of this range. `None` = the channel is not checked.
 fn needed_values(channel: Channel, (model, series): (Option<&CellModel>, u16)) -> Option<(f64, f64)> {
     // Without a model, the range covers any lithium-ion cell.
     let (low, high) = model.map_or((1.2, 4.6), |model| (model.voltage_min_v, model.voltage_max_v));
@@ -114,7 +114,7 @@ fn unreadable(place: &TablePlace, signals: &[&ResolvedSignal<'_>]) {
 
 /// Reports signals, and multiplexors of these signals, that extend beyond their message. Reports one fault per table.
 fn ends(place: &TablePlace, signals: &[&ResolvedSignal<'_>]) {
-    // The length of an answer is unknown until it arrives.
+    // The length of a diagnostic answer is unknown until the answer arrives.
     let in_frames = signals.iter().filter(|resolved| resolved.answer.is_none());
     let parts = in_frames.flat_map(|resolved| {
         let selectors = selectors(resolved).map(|(_, selector)| selector);
@@ -163,7 +163,7 @@ fn selectors<'r>(resolved: &'r ResolvedSignal<'_>) -> impl Iterator<Item = (&'r 
     conditions.filter_map(|condition| Some((condition, resolved.message.signals.get(condition.selector)?)))
 }
 
-/// Reports inputs that share bits of one message with each other or with a multiplexor: one fault per table.
+/// Reports inputs whose bits in a message overlap with another input or with a multiplexor: one fault per table.
 fn overlaps(raw: &RawTables, found: &[ResolvedSignal<'_>]) {
     for (place, signals) in by_table(raw, found) {
         let mut pairs: Vec<(String, String)> = Vec::new();
@@ -199,8 +199,8 @@ fn is_beside(a: &ResolvedSignal<'_>, b: &ResolvedSignal<'_>) -> bool {
         && !a.signal.conditions.iter().any(is_other_page)
 }
 
-/// Whether two inputs of one message share bits. In a diagnostic answer, each layout counts from the first byte of its
-/// signal, so the position of this byte is added.
+/// Whether two inputs of one message share bits. In a diagnostic answer, a signal's layout counts from the signal's own
+/// first byte, so the position of this byte in the answer is added.
 fn has_bits_of(a: &ResolvedSignal<'_>, b: &ResolvedSignal<'_>) -> bool {
     let bits = |resolved: &ResolvedSignal<'_>| {
         let first = resolved.answer?.bit(&resolved.signal.layout);
@@ -276,8 +276,8 @@ fn other_quantity(place: &TablePlace, found: Quantity, (name, unit, wanted): (&s
     }
 }
 
-/// Checks that `scale` and `offset` convert the DBC's unit to the input's unit. `is_held` states whether the bits can
-/// encode a plausible value in the DBC's unit. If the bits cannot, the DBC's unit is wrong.
+/// Checks that `scale` and `offset` convert the DBC's unit to the input's unit. `is_held` states whether the signal's
+/// bits can encode a plausible value in the DBC's unit. If they cannot, the DBC's unit is wrong.
 fn conversion(
     place: &TablePlace,
     (resolved, unit, is_held): (&ResolvedSignal<'_>, SignalUnit, bool),
@@ -332,7 +332,8 @@ struct AllowedRange<'a> {
     input: Option<&'a TablePlace>,
 }
 
-/// Reports ranges of plausible readings that are empty, and voltage ranges that exclude all voltages of the cell model.
+/// Reports a range of plausible readings that contains no value, and a voltage range that contains no voltage of the
+/// cell model.
 pub(crate) fn ranges(raw: &RawTables, found: &[ResolvedSignal<'_>], model: Option<&CellModel>) {
     let Some(pack) = &raw.pack else { return };
     let readable: Vec<ResolvedSignal<'_>> = found.iter().filter(|input| input.binding().is_ok()).cloned().collect();
@@ -418,8 +419,8 @@ pub(crate) fn initial_capacity(raw: &RawTables, model: Option<&CellModel>) {
     initial_of(&pack.place, pack.initial_capacity_ah, model);
 }
 
-/// Reports an implausible initial or rated capacity of a module. Also reports a module whose rated capacity differs
-/// much from `own_ah`, the rated capacity of the pack's own cells.
+/// Reports an implausible initial or rated capacity of a module (cells of another type in the same pack). Also reports
+/// a module whose rated capacity differs much from `own_ah`, the rated capacity of the pack's own cells.
 pub(crate) fn module(Module { keys, model, .. }: &Module<'_>, own_ah: Option<f64>) {
     let beside = own_ah.map_or(1.0, |own_ah| model.rated_capacity_ah / own_ah);
     if let Some(own_ah) = own_ah.filter(|_| beside.max(1.0 / beside) >= OTHER_CELL) {
@@ -474,9 +475,10 @@ pub(crate) fn rated_capacity(raw: &RawTables, model: Option<&CellModel>) {
     }
 }
 
-/// Returns a hint whether parallel cells explain why the capacity is `ratio` times the capacity of one cell.
+/// The configured capacity is `ratio` times the capacity of one cell. Returns a hint whether parallel cells explain
+/// this ratio; empty for a ratio of at most 1.
 fn parallel_cells(ratio: f64, strings: u16) -> String {
-    // Different sources state capacities of the same cell that differ by less than 5 %.
+    // The capacities that different sources state for the same cell differ by less than 5 %.
     let is_about = |cells: f64| (ratio / cells - 1.0).abs() <= 0.05;
     let whole = ratio.round();
     if strings > 1 && is_about(f64::from(strings)) {

@@ -51,8 +51,8 @@ pub(crate) fn guards(raw: &RawTables, found: &[ResolvedSignal<'_>], inputs_whole
     guards
 }
 
-/// Reports a message with the pack identity that is not protected, unless `accept_unprotected` is set. A forged
-/// identity would set aside all learned values.
+/// If the message with the pack identity is not protected, reports a fault, unless `accept_unprotected` is set. A
+/// forged identity would set aside all learned values.
 fn check_identity(raw: &RawTables, found: &[ResolvedSignal<'_>], guards: &[GuardConfig]) {
     let Some(keys) = raw.pack_identity.as_ref().filter(|keys| !keys.accept_unprotected) else { return };
     let is_protected =

@@ -22,8 +22,8 @@ use crate::quantity::{BusIndex, CellIndex, Channel};
 
 const MAX_NAMED_CELLS: usize = 8;
 
-/// Largest length of a pack identity, bits. A reading is a 64-bit float, which represents integers of up to 53 bits
-/// exactly.
+/// Largest length of a pack identity (for example a serial number), bits. A reading is a 64-bit float, which represents
+/// integers of up to 53 bits exactly.
 const MAX_IDENTITY_BITS: u16 = 53;
 
 #[derive(Debug)]
@@ -401,7 +401,8 @@ fn list(numbers: &[u32]) -> String {
 }
 
 impl ResolvedSignal<'_> {
-    /// The signal's binding for the decoder. Its range is the DBC's range; the sample stage checks plausibility later.
+    /// Creates the binding with which the decoder reads the signal. The decoder checks only the DBC's range; the sample
+    /// stage checks plausibility later.
     pub(crate) fn binding(&self) -> Result<Binding, LayoutFault> {
         let mut binding = Binding::new(self.bus, self.message, self.signal, self.channel)?;
         binding.scale = self.scale;

@@ -72,8 +72,8 @@ fn has_header(document: &Document<'_>, value: &Spanned<DeValue<'_>>) -> bool {
     (value.get_ref().is_table() || is_list_of_tables(value)) && !is_inline(document, value)
 }
 
-/// Whether the text of a value at its position contains the whole value. It does not if the table has a header, or if
-/// another file adds keys or elements to the value.
+/// Whether a single piece of text in one file contains the whole value. This is not the case if the value is a table
+/// with a header, or if another file adds keys or elements to the value.
 fn is_inline(document: &Document<'_>, value: &Spanned<DeValue<'_>>) -> bool {
     let (span, written) = (value.span(), document.written(&value.span()));
     let is_within = |part: std::ops::Range<usize>| span.start <= part.start && part.end <= span.end;

@@ -25,7 +25,7 @@ pub(crate) struct PartialConfig {
 }
 
 impl PartialConfig {
-    /// Reads the parts that can be read. `read` reads the files.
+    /// Reads the parts that can be read. `read_file` reads the files.
     ///
     /// # Errors
     /// Fails if the configuration file, a drop-in or a DBC file cannot be read, if a table `[[input.diagnostic]]` is

@@ -1,5 +1,5 @@
-//! Tests definitions as they occur in the field: a faulty message in a DBC, J1939 source addresses, and a current whose
-//! direction is in another signal.
+//! Tests signal definitions of the kinds that real DBC files contain: a faulty message, J1939 source addresses, and a
+//! current whose direction is in another signal.
 
 use packwatch_core::can::decode::{GroupFrame, GroupSenders};
 
@@ -49,7 +49,8 @@ fn j1939(format: &str) -> String {
     format!("{dbc}BA_DEF_ BO_ \"VFrameFormat\" ENUM {formats};\nBA_DEF_DEF_ \"VFrameFormat\" \"{format}\";\n")
 }
 
-/// The identifier of the frame after its parameter group was looked up.
+/// Looks up the parameter group of a frame with the identifier `sent`. Returns the identifier under which the
+/// configuration knows this group.
 fn configured(config: &Config, sent: u32) -> u32 {
     let frame = Frame::classic(CanId::Extended(sent), &[0; 8]).unwrap();
     match config.monitor.input.groups().configured(
@@ -113,7 +114,7 @@ fn sign_key_reads_direction_of_magnitude() {
     let sample = &config.monitor.sample;
     assert!(sample.direction.is_some());
     assert_eq!((sample.current.min, sample.current.max), (-500.0, 500.0), "the magnitude limits both directions");
-    // The meaning of a positive value does not change a magnitude.
+    // `positive` changes nothing, because the current is a magnitude and its direction is in another signal.
     let both = with_sign("{ signal = \"Status.Charging\", charge = [1] }\npositive = \"charge\"");
     assert_eq!(read(&both, &magnitude()).unwrap().monitor.input, *input);
 }

@@ -1,4 +1,4 @@
-//! Tests the page in headless Chromium, with a fake daemon.
+//! Tests the exporter's live page in headless Chromium, with a fake daemon.
 
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 
@@ -31,7 +31,7 @@ impl Browser {
         Some(Self { questions: process.stdin.take(), answers, process })
     }
 
-    /// The value of an expression of JavaScript.
+    /// Evaluates a JavaScript expression in the page.
     fn ask(&mut self, expression: &str) -> Value {
         writeln!(self.questions.as_mut().unwrap(), "{expression}").unwrap();
         self.answer()
@@ -60,7 +60,8 @@ impl Browser {
         serde_json::from_value(texts).unwrap()
     }
 
-    /// Closes the page. Returns the page's requests, its messages and the overflow of its width (px).
+    /// Closes the page. Returns the requests that the page made, its console messages, and by how many pixels it is
+    /// wider than the window.
     fn close(mut self) -> Value {
         self.questions = None;
         let report = self.answer();
@@ -149,7 +150,8 @@ fn page_shows_what_the_document_says() {
     assert_eq!(browser.texts("img").len(), 0, "names are text");
     assert!(browser.ask(labels)[0].as_str().unwrap().ends_with("alarm or finding"));
 
-    // Damages the page's own state: a document that it cannot read, a clock that was set back, a late document.
+    // Changes the page's own variables: a document that the page cannot read, a clock that was set back, a slow
+    // connection.
     daemon.report(healthy());
     browser.wait_for_headline(HEALTHY);
     let mut head =
@@ -175,7 +177,7 @@ fn page_shows_what_the_document_says() {
     browser.wait_for_headline(HEALTHY);
     assert_eq!(browser.texts("#now b")[0], "50.0 %");
     let mut report = browser.close();
-    // On a busy machine, the page may lose the stream and ask for it again.
+    // On a busy machine, the page may lose the event stream and request it again.
     report["requests"].as_array_mut().unwrap().dedup();
     assert_eq!(report, json!({ "requests": [format!("{url}events")], "messages": [], "overflow_px": 0 }));
 }
@@ -197,7 +199,7 @@ fn page_fits_phone_and_many_cells() {
     };
     browser.wait_for_headline("Severe alarm: capacity low, cell 1: 2.412 Ah, limit 2.500 Ah");
     assert_eq!(browser.texts("#map div").len(), 1024);
-    // CPU time does not depend on the load by other programs.
+    // CPU time is measured, because it does not depend on the load by other programs.
     let spent_ms = || {
         let statistics = std::fs::read_to_string(thread.join("schedstat")).unwrap();
         statistics.split(' ').next().unwrap().parse::<f64>().unwrap() / 1e6

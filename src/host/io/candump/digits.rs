@@ -1,7 +1,8 @@
 //! Converts the digits of a candump line several bytes at a time. Some functions treat a `u64` as eight lanes of one
 //! byte each, with the first byte of the text in the lowest lane. Others use loops that compile to vector instructions.
 
-/// A word with 1 in every byte. `HIGHS` has only the highest bit of every byte set.
+/// `ONES` is a word with the value 1 in every byte. `HIGHS` is a word in which only the highest bit of every byte is
+/// set.
 const ONES: u64 = 0x0101_0101_0101_0101;
 const HIGHS: u64 = 0x80 * ONES;
 
@@ -27,7 +28,7 @@ pub(super) fn word(text: &[u8], at: usize) -> u64 {
 /// Parses six digits followed by `) `; the result is in nanoseconds.
 #[inline(always)]
 pub(super) fn six_decimals(text: u64) -> Option<i64> {
-    // Two leading zeros extend the six digits to eight.
+    // The shift removes the `) ` and puts two zeros before the six digits, so there are eight digits.
     lanes(text ^ u64::from_le_bytes(*b"000000) "), 0x7F7F_7676_7676_7676).map(|digits| number::<1000>(digits << 16))
 }
 
@@ -37,8 +38,9 @@ pub(super) fn eight_digits(text: u64) -> Option<i64> {
     lanes(text ^ (u64::from(b'0') * ONES), 0x76 * ONES).map(number::<1>)
 }
 
-/// Returns `lanes` if all lanes are valid, otherwise `None`. A lane is invalid if it is 0x80 or more, before or after
-/// `wrong` is added. The caller chooses `wrong` so that lanes above the largest valid value become 0x80 or more.
+/// Returns `lanes` if all lanes are valid, otherwise `None`. A lane is valid if it is below 0x80, both before and after
+/// `wrong` is added. The caller chooses `wrong` so that the addition moves every value above the largest valid one to
+/// 0x80 or more.
 #[inline(always)]
 fn lanes(lanes: u64, wrong: u64) -> Option<u64> {
     ((lanes | lanes.wrapping_add(wrong)) & HIGHS == 0).then_some(lanes)

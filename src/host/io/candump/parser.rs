@@ -12,7 +12,7 @@ use crate::quantity::{BusIndex, Timestamp};
 
 /// Largest 29-bit identifier, and the mask of an error frame's class bits.
 const MAX_EXTENDED: u32 = 0x1FFF_FFFF;
-/// Initial value of `head`. It matches no line, because the overlapping bytes of its two words differ.
+/// Initial value of `LineParser::head`. It matches no line, because the overlapping bytes of its two words differ.
 const NO_HEAD: [u64; 2] = [0, u64::MAX];
 
 #[derive(Debug, Clone, Copy)]

@@ -34,14 +34,14 @@ pub(super) enum Role {
     Step,
     /// Whether the row belongs to a charge or a discharge, in words.
     State,
-    /// Charge taken out since the beginning of the file; of the opposite sign in the Battery Data Format.
+    /// Charge taken out since the beginning of the file. In the Battery Data Format, the column has the opposite sign.
     Discharged,
     NetCharged,
     Soc,
 }
 
-/// Names of each role, divided by bars. A column of a later line is used only if the file has no column of an earlier
-/// line.
+/// Names of each role, divided by bars. If a role has several lines, the earlier line is preferred: a name of a later
+/// line is used only if the file has no column with a name of an earlier line.
 const NAMES: [(Role, &str); 19] = [
     (Role::Time, "test time|total time|testtime|totaltime|prog time|program time|program duration|test"),
     (
@@ -163,7 +163,8 @@ pub(super) fn known(name: &str, unit: &str) -> Vec<Known> {
     name.with_last_word_as_unit().map_or_else(Vec::new, |name| lookup(&name))
 }
 
-/// The role and the unit of a column whose unit is unknown: in the line of units, in brackets or after a slash.
+/// The role of a column and the text of its unit, if packwatch does not know this unit. The unit is in the line of
+/// units, in brackets or after a slash.
 pub(super) fn unknown_unit(name: &str, unit: &str) -> Option<(Role, String)> {
     let trimmed = |text: &str| text.trim_matches(['(', '[', '{', ')', ']', '}', ' ']).to_owned();
     let (words, text) = if trimmed(unit).is_empty() { name.rsplit_once(['(', '[', '{', '/'])? } else { (name, unit) };

@@ -20,7 +20,7 @@ pub(super) struct Judgement {
     pub(super) time_form: TimeForm,
     /// Whether the unit of time is a guess.
     pub(super) is_time_assumed: bool,
-    /// Whether the first time is after the following times, which are in order.
+    /// Whether the first row has a later time than the next rows, although the next rows are in order.
     pub(super) is_first_time_late: bool,
     pub(super) sign: CurrentSign,
     pub(super) notes: Vec<String>,
@@ -29,7 +29,7 @@ pub(super) struct Judgement {
 #[derive(Debug, Default)]
 struct Samples {
     time_texts: Vec<String>,
-    /// Times as numbers in the unit of the file; only for times without colons.
+    /// Times as numbers in the unit of the file. NaN for a time that is not a number, such as a date.
     raw_times: Vec<f64>,
     currents: Vec<f64>,
     voltages: Vec<f64>,
@@ -88,7 +88,7 @@ pub(super) fn judge(first: &FirstRows, layout: &mut Layout, options: &CsvOptions
     Judge { header: &first.header, options, samples, notes: std::mem::take(&mut layout.notes) }.run(layout)
 }
 
-/// Maximum number of different states that are numbers.
+/// If the state column contains more different numbers than this, the numbers are not used as states.
 const MAX_CODES: usize = 8;
 
 struct Judge<'a> {
@@ -130,7 +130,7 @@ impl Judge<'_> {
         Ok(Judgement { time, time_form, is_time_assumed, is_first_time_late, sign, notes: self.notes })
     }
 
-    /// The error for a column whose values are not in its unit.
+    /// The error for a column whose values are impossible in its unit.
     fn fault(&self, layout: &Layout, of: &Implausible) -> TableError {
         let voltage = || layout.channels.iter().find(|(channel, _)| is_voltage(*channel)).map(|of| of.1);
         let column = match of.quantity {
@@ -269,8 +269,8 @@ impl Judge<'_> {
         Ok((reader, form, is_assumed, times))
     }
 
-    /// Whether the dates of the table begin with the day. If the dates do not decide, the order with the shorter
-    /// record is assumed.
+    /// Whether the dates of the table begin with the day. If the dates allow both orders (day or month first), the
+    /// order that gives the shorter record is assumed.
     fn is_day_first(&mut self, form: TimeForm) -> bool {
         if form != TimeForm::Date {
             return false;
@@ -296,13 +296,13 @@ impl Judge<'_> {
             // Seconds since 1970.
             return (layout.time.unit, false);
         }
-        // Several rows may have the same time in whole seconds.
+        // If times are written in whole seconds, several rows may have the same time.
         let mut distinct = raw.clone();
         distinct.dedup();
         let step = plausible::median_step(&distinct).unwrap_or_default();
         let days = find("Excel days");
-        // Excel days from 1970 to 2100, with rows at most some minutes apart. As seconds, the rows would be less than
-        // 4 ms apart.
+        // Numbers in this range may be Excel days from 1970 to 2100 whose rows are at most some minutes apart. If they
+        // were seconds, the rows would be less than 4 ms apart.
         if (25_569.0..73_051.0).contains(&middle) && step > 0.0 && step < 0.004 && self.is_possible_time_unit(raw, days)
         {
             return (days, true);
@@ -330,14 +330,14 @@ impl Judge<'_> {
             && plausible::check_slope(&times, currents, voltages, capacity_ah).is_ok()
     }
 
-    /// The charge computed from the currents, divided by the charge that a column of the table states, if the times
-    /// are in `unit`. Three kinds of rows do not count: gaps, small currents (which may be an offset), and rows in
-    /// which the column restarts.
+    /// The ratio of two charges, under the assumption that the times are in `unit`: the charge computed from the
+    /// currents, divided by the charge that a column of the table states. Three kinds of rows do not count: gaps, small
+    /// currents (which may be an offset), and rows in which the column restarts.
     fn charge_ratio(&self, raw_times: &[f64], unit: &Unit) -> Option<f64> {
         let Samples { currents, discharged, .. } = &self.samples;
         let longest = plausible::longest_step(raw_times);
         let smallest = 0.05 * currents.iter().copied().filter(|i| i.is_finite()).fold(0.0, |max, i| i.abs().max(max));
-        // Charge of the currents and of the column, for each possible sign of the current.
+        // For each possible sign of the current: the charge computed from the currents, and the charge of the column.
         let mut sums = [(0.0, 0.0); 2];
         for (n, step) in raw_times.windows(2).enumerate().map(|(n, pair)| (n, pair[1] - pair[0])) {
             let (current, change) = (currents[n], discharged[n + 1] - discharged[n]);
@@ -352,8 +352,8 @@ impl Judge<'_> {
         (charge > 0.0 && stated > 0.0).then(|| charge / stated)
     }
 
-    /// The unit closest to `unit`, longer or shorter, that is possible for this table and gives rows at least 20 ms
-    /// apart.
+    /// Returns the next longer unit (if `is_longer`), or else the next shorter unit, that is possible for this table
+    /// and gives rows at least 20 ms apart.
     fn other_time_unit(&self, unit: &Unit, is_longer: bool) -> Option<&'static str> {
         let raw = &self.samples.raw_times;
         let step = plausible::median_step(raw).unwrap_or_default();
@@ -368,8 +368,9 @@ impl Judge<'_> {
         if is_longer { units.into_iter().find(is_possible) } else { units.into_iter().rev().find(is_possible) }
     }
 
-    /// Adds a note if the times are probably in another unit than the stated unit. For example, the times advance
-    /// like those of a longer unit, or they are too short for the voltages.
+    /// Adds a note if the times are probably not in the stated unit. Signs of this are: the voltage changes although
+    /// too little charge flows; or the times advance like whole seconds that are written in a longer unit; or they
+    /// advance by less than 0.1 s per row in a unit shorter than a second.
     fn note_other_unit(&mut self, layout: &Layout, stated: &Unit, times: &[f64]) {
         let Samples { currents, voltages, .. } = &self.samples;
         let slope = self.options.capacity_ah.and_then(|ah| plausible::check_slope(times, currents, voltages, ah).err());
@@ -413,7 +414,8 @@ impl Judge<'_> {
         Err(self.fault(layout, &Implausible { quantity, what, probable: Some(unit) }))
     }
 
-    /// Drops a section column that the user did not name, unless the time restarts where its value changes.
+    /// A section column divides the table into parts with their own time. If the user did not name this column, and the
+    /// time does not restart where its value changes, the column is not used.
     fn keep_section(&self, layout: &mut Layout, times: &[f64]) {
         if layout.is_section_named || layout.format == Format::Packwatch || layout.is_step_time {
             return;
@@ -426,7 +428,8 @@ impl Judge<'_> {
         }
     }
 
-    /// The directions of states that are numbers. Empty unless the voltage shows both a charge and a discharge.
+    /// Finds from the voltage which of the states that are numbers mean charge, and which mean discharge. The list is
+    /// empty unless the voltage shows both a charge and a discharge.
     fn codes(&self, layout: &Layout, times: &[f64]) -> Vec<(Vec<u8>, Direction)> {
         let Samples { states, currents, voltages, .. } = &self.samples;
         let mut codes: Vec<Vec<u8>> = states.iter().filter(|state| is_code(state)).cloned().collect();
@@ -464,8 +467,8 @@ impl Judge<'_> {
             .count()
         };
         let [discharges, charges] = [Direction::Discharge, Direction::Charge].map(|direction| count(direction, true));
-        // If a positive current occurs in charges and in discharges, the current is a magnitude. Single negative
-        // currents are then faults.
+        // If the current is positive in charges and in discharges, it is a magnitude, so single negative currents are
+        // faults.
         let is_magnitude = negative < charges.min(discharges) && 100 * negative <= samples.currents.len();
         let is_never_negative = negative == 0 || is_magnitude;
         let codes = if is_never_negative { self.codes(layout, times) } else { Vec::new() };
@@ -535,8 +538,9 @@ fn is_voltage(channel: Channel) -> bool {
     matches!(channel, Channel::PackVoltage | Channel::CellVoltage(_))
 }
 
-/// The unit (min or h) in which the times are whole seconds, such as rows at every 1/60 min. `None` if the times are
-/// decimal seconds, that is, have even steps with at most four decimals.
+/// Returns min or h if the times are whole seconds when they are read in this unit (example: rows 1/60 min apart).
+/// `None` if this holds for neither unit, or if the times have even steps with at most four decimals, because such
+/// times are usually seconds.
 fn grid_unit(times: &[f64]) -> Option<&'static str> {
     let step = plausible::median_step(times).filter(|step| (0.0..0.9).contains(step) && *step > 0.0)?;
     let known: Vec<f64> = times.iter().copied().filter(|time| time.is_finite()).collect();

@@ -1,8 +1,9 @@
 //! Chooses the columns of a table of samples.
 //!
-//! In: the header and the options. Out: a [`Layout`] with the column and the unit of each role. A column has the name
-//! that the user gives, otherwise a name of the [dictionary](super::dictionary). If several columns fit, the first
-//! column whose first values can be read is chosen. A unit that does not fit the role is an error.
+//! In: the header and the options. Out: a [`Layout`] with the column and the unit of each role. If the user names a
+//! column for a role, this column is used. Otherwise, a column whose name is in the [dictionary](super::dictionary) is
+//! used. If several columns fit, the first column whose first values can be read is chosen. A unit that does not fit
+//! the role is an error.
 
 use super::CsvOptions;
 use super::column_name::ColumnName;
@@ -29,7 +30,8 @@ pub(super) struct Layout {
     pub(super) is_step_time: bool,
     pub(super) channels: Vec<(Channel, Column)>,
     pub(super) state: Option<usize>,
-    /// Charge taken out, with its factor: -1 for a net charge, otherwise 1.
+    /// Column of the charge taken out, and the factor by which its values are multiplied: -1 if the column contains
+    /// charged minus discharged, otherwise 1.
     pub(super) discharged: Option<(Column, f64)>,
     pub(super) section: Option<usize>,
     pub(super) is_section_named: bool,
@@ -129,7 +131,8 @@ impl<'a> Columns<'a> {
         self.options.columns.iter().rev().find(|(r, _)| r == role).map(|(_, column)| column.as_str())
     }
 
-    /// The column that the user names. A unit in brackets, which the file does not have, may follow the name.
+    /// The column that the user names. The user may append a unit in brackets, which is not part of the name in the
+    /// file.
     fn named(&self, role: &str, name: &str, quantity: Option<Quantity>) -> Result<Column, TableError> {
         let stated = name.strip_suffix(']').and_then(|rest| rest.rsplit_once('['));
         let exact = self.header.find(name).map(|index| (index, None));
@@ -178,8 +181,7 @@ impl<'a> Columns<'a> {
         ))
     }
 
-    /// The best columns of a role, in the order of the file. Their names are in the most preferred line of the
-    /// dictionary.
+    /// The columns of a role whose names are in the most preferred line of the dictionary, in the order of the file.
     fn best_all(&self, role: Role) -> Vec<(usize, Known)> {
         let of_role = || self.known.iter().filter(|(_, known)| known.role == role);
         let best = of_role().map(|(_, known)| known.rank).min();
@@ -202,8 +204,8 @@ impl<'a> Columns<'a> {
         }
     }
 
-    /// The column of time, and whether its time restarts at each step. In Neware's exports, `Time` is the time of the
-    /// step.
+    /// The column of time, and whether its time restarts at each step of the test. In Neware's exports, `Time` counts
+    /// from the start of the step.
     fn time(&self) -> Result<(Column, bool), TableError> {
         if let Some(column) = self.mapped("time") {
             return Ok((self.named("time", column, Some(Quantity::Time))?, false));
@@ -267,7 +269,7 @@ impl<'a> Columns<'a> {
             }
             None => {
                 let mut best = self.best_all(Role::Temperature);
-                // If a sensor has columns in two units, it counts once.
+                // If a sensor has two columns with different units, only one of them is used.
                 let mut numbers = Vec::new();
                 best.retain(|(_, known)| {
                     let is_new = !numbers.contains(&known.number);
@@ -315,8 +317,8 @@ impl<'a> Columns<'a> {
         Ok(())
     }
 
-    /// The columns of the cell voltages, numbered from 0 or from 1. There must be as many as cells in the
-    /// configuration.
+    /// The columns of the cell voltages, numbered from 0 or from 1. The number of columns must equal the number of
+    /// cells in the configuration.
     fn cell_columns(&self) -> Result<Vec<Column>, TableError> {
         let cells = usize::from(self.options.cells);
         let mut found: Vec<(usize, Known)> =
@@ -350,12 +352,13 @@ impl<'a> Columns<'a> {
     }
 }
 
-/// Maps roles that replace each other (time and date) to one role. Within this role, readable columns are preferred.
+/// Maps the roles time and date to one role, because either column gives the time. Of the columns with this common
+/// role, the readable ones are preferred.
 fn group(role: Role) -> Role {
     if role == Role::Time { Role::Date } else { role }
 }
 
-/// Whether the first values of a column can be what its role says.
+/// Whether the first values of a column can be read as values of its role.
 fn is_readable(first: &FirstRows, index: usize, known: &Known) -> bool {
     const JUDGED_ROWS: usize = 200;
     let rows = || first.rows().take(JUDGED_ROWS);
@@ -365,7 +368,7 @@ fn is_readable(first: &FirstRows, index: usize, known: &Known) -> bool {
             let mut reader = TimeText::new(known.unit.unwrap_or(Unit::base(Quantity::Time)));
             let texts: Vec<_> = rows().map(|row| row.text(index)).collect();
             reader.is_day_first = TimeText::is_day_first(&texts).0;
-            // The unit of the numbers is unknown, so their size does not matter.
+            // Any number is accepted, because the unit may be unknown. Only the order of the times is checked.
             let number = |text: &str| {
                 parse_field(text.as_bytes()).flatten().or_else(|| Some(reader.parse(text.as_bytes())?.secs()))
             };

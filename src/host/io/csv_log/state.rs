@@ -13,7 +13,8 @@ pub(super) enum Direction {
 /// Parts of words for a discharge, without accents.
 const DISCHARGE: &str = "disch dsg entlad ontlad utlad urlad aflad descarg scaric rozlad \
     \u{440}\u{430}\u{437}\u{440}\u{44f}\u{434} \u{653e}\u{7535} \u{653e}\u{96fb}";
-/// Beginnings of words for a discharge. Inside a word they may be part of two words, as in `gridcharging`.
+/// Beginnings of words for a discharge. Inside a word, these letters do not count, because they may belong to two
+/// words, as `dch` does in `gridcharging`.
 const DISCHARGE_START: [&str; 3] = ["dch", "dsch", "dech"];
 const CHARGE: &str = "charg chrg chg regen lade ladu ladd ladn ladi ladow carga caric \
     \u{437}\u{430}\u{440}\u{44f}\u{434} \u{5145}\u{7535} \u{5145}\u{96fb}";
@@ -55,7 +56,7 @@ pub(super) fn direction(state: &[u8]) -> Option<Direction> {
     let is = |list: &str| words.iter().any(|word| list.split(' ').any(|of| of == word));
     let has = |parts: &str| words.iter().any(|word| parts.split(' ').any(|part| word.contains(part)));
     let is_divided = words.windows(2).any(|pair| ["d", "dis", "de"].contains(&&*pair[0]) && pair[1].starts_with("ch"));
-    // `CC`, `CV`, `CP` and `CR` may precede the word.
+    // The word may directly follow `CC`, `CV`, `CP` or `CR`, as in `CCDChg`.
     let bare = |word: &String| word.trim_start_matches(|c: char| c.is_ascii_digit() || "cvpr".contains(c)).to_owned();
     let is_begun = words.iter().map(bare).any(|word| DISCHARGE_START.iter().any(|start| word.starts_with(start)));
     match () {

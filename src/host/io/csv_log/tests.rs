@@ -42,7 +42,8 @@ fn state_column_gives_sign_of_magnitude() {
 
 #[test]
 fn signed_current_after_long_charge_keeps_sign() {
-    // The first rows are a charge, so only the first discharge shows that the current has a sign.
+    // In a charge of this format, a current of 1 A may be a magnitude or a signed current. The table begins with a
+    // charge of 60,000 rows, so only the first discharge (-2 A) shows that the current is signed.
     let charge: String = (0..60_000).map(|n| format!("{n},1.0,3.9,CC Chg\n")).collect();
     let text =
         format!("Total Time(s),Current(A),Voltage(V),Step Type\n{charge}60000,-2,3.7,CC DChg\n60001,0.5,3.8,CC DChg\n");
@@ -57,7 +58,8 @@ fn signed_current_after_long_charge_keeps_sign() {
 
 #[test]
 fn one_sided_beginning_does_not_decide_magnitude() {
-    // One megabyte of discharge, then a charge. The current is signed, with either sign, or a magnitude.
+    // One megabyte of discharge, then a charge. Three kinds of current: positive = discharge, positive = charge, and a
+    // magnitude.
     let rows = |sign: f64, word: &str, count: usize| -> String {
         (0..count).map(|_| format!("{},3.7,{word}\n", sign * 2.0)).collect()
     };

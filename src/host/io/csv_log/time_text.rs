@@ -18,7 +18,7 @@ pub(super) enum TimeForm {
 pub(super) struct TimeText {
     pub(super) unit: &'static Unit,
     pub(super) is_day_first: bool,
-    /// Whether a time of day that restarts at midnight belongs to the next day.
+    /// Whether a time of day that is earlier than the time before it belongs to the next day.
     pub(super) wraps: bool,
     last_clock: Option<i64>,
     days: i64,
@@ -37,8 +37,9 @@ impl TimeText {
         if is_date { TimeForm::Date } else { TimeForm::Clock }
     }
 
-    /// Whether dates begin with the day, and whether this is a guess. The order in which more dates can be read is
-    /// right. If all dates can be read in both orders, the order that gives the shorter record is a guess.
+    /// Whether dates begin with the day (and not with the month), and whether this is a guess. If one order can read
+    /// more of the dates than the other, it is right. If both orders can read the same number, the order that gives the
+    /// shorter record is taken as a guess.
     pub(super) fn is_day_first(texts: &[impl AsRef<str>]) -> (bool, bool) {
         let read = |text: &str| [true, false].map(|is_day_first| stamp::parse_date(text, is_day_first));
         let dates: Vec<[Option<Timestamp>; 2]> =
@@ -74,7 +75,8 @@ impl TimeText {
             return count.checked_mul(nanos).map(Timestamp::from_nanos).filter(|time| is_representable(*time));
         }
         let seconds = self.unit.convert(text.parse().ok()?);
-        // Programs round minutes, hours and days to some digits, so a sample after one minute is not exactly at 60 s.
+        // Programs write times in minutes, hours or days with few digits. A sample after one minute would then not be
+        // exactly at 60 s, so the result is rounded to 0.1 ms.
         let seconds = if self.unit.per_base() < 1.0 { (seconds * 1e4).round() / 1e4 } else { seconds };
         let time = seconds.is_finite().then(|| Timestamp::from_secs(seconds));
         time.filter(|time| is_representable(*time))
@@ -101,7 +103,7 @@ fn is_representable(time: Timestamp) -> bool {
 mod tests {
     use super::*;
 
-    /// Times in milliseconds.
+    /// Parses the texts as times in `unit`. Returns milliseconds.
     fn times(unit: &str, texts: &[&str]) -> Vec<Option<i64>> {
         let mut reader = TimeText::new(Unit::find(unit).expect("known"));
         texts.iter().map(|text| reader.parse(text.as_bytes()).map(|time| time.nanos() / 1_000_000)).collect()

@@ -1,5 +1,5 @@
-//! Counters of a link since the program's start. The link's task and the sending end write the counters, and other
-//! tasks read them.
+//! Counters of a link (the daemon's connection to one CAN interface) since the program's start. The task that receives
+//! and the part that sends write the counters, and other tasks read them.
 
 use std::sync::{Mutex, PoisonError};
 

@@ -34,8 +34,8 @@ const LONGEST_PAUSE: Duration = Duration::from_secs(1);
 /// Number of frames read before other tasks run. A full 1 Mbit/s bus sends this many frames in 8 ms, which is less than
 /// one tick of the daemon (10 ms).
 const READ_BATCH: usize = 64;
-/// Maximum number of frames that wait to be sent. With default periods, the status, health, digest and alarm frames of
-/// one second are fewer, even in an alarm flood (at most 100 alarm frames a second).
+/// Maximum number of frames that wait to be sent. With default periods, the daemon sends fewer frames than this in one
+/// second, even in an alarm flood (at most 100 alarm frames a second).
 const SEND_QUEUE: usize = 256;
 
 /// Settings of a link.

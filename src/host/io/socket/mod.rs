@@ -4,7 +4,8 @@
 //!   `CanSender::open("vcan0", fd)?`, then `sender.send(&frame)?`. If the transmit queue is full, `send` waits up to a
 //!   limit.
 //! * `PassiveSocket`: receives everything on an interface for `doctor`, or frames of some identifiers for `test-alarm`.
-//! * `Link`: the daemon's task for one interface. It receives, sends, and survives every state of the interface.
+//! * `Link`: the daemon's task for one interface. It receives and sends, and keeps running in every state of the
+//!   interface.
 //!
 //! These types use two layers: `raw` is one socket, and `wire` converts frames to and from the kernel's byte layouts.
 

@@ -21,7 +21,7 @@ pub struct PassiveSocket {
     /// Frames of the latest call; kept to reuse the memory.
     received: Vec<RawRead>,
     dropped_total: u32,
-    /// Clock reading taken before the next call that reads frames.
+    /// Clock reading taken after the latest read from the socket.
     before: Reading,
 }
 

@@ -104,8 +104,8 @@ pub(crate) fn explained(error: &io::Error) -> String {
 }
 
 impl RawSocket {
-    /// Opens and binds the socket. If `fd`, the socket also receives FD frames. Filters are set before the bind, so
-    /// that no unwanted frame is queued.
+    /// Opens and binds the socket. If `fd` is true, the socket also receives FD frames. Filters are set before the
+    /// bind, so that no unwanted frame is queued.
     ///
     /// # Errors
     /// Returns `ENODEV` if the interface does not exist. If the interface is down, the call succeeds, and
@@ -155,8 +155,8 @@ impl RawSocket {
         SLOTS.with_borrow_mut(|slots| slots.receive(self.socket.as_raw_fd(), into))
     }
 
-    /// Number of frames lost since the socket was opened because its receive buffer was full, modulo 2^32. The number
-    /// is 0 if the kernel has no such counter.
+    /// Number of frames that the kernel has dropped since the socket was opened, because the receive buffer was full
+    /// (modulo 2^32). The number is 0 if the kernel has no such counter.
     pub(super) fn dropped_total(&self) -> u32 {
         // SO_MEMINFO returns nine numbers. The last one counts drops (linux/sock_diag.h, since Linux 4.12).
         let mut bytes = [0; 9 * size_of::<u32>()];
@@ -278,7 +278,8 @@ mod tests {
 
     #[test]
     fn frames_without_stamps_keep_later_stamps() {
-        // Any datagram socket works here, because the kernel's headers are the same.
+        // A UDP socket can replace the CAN socket here, because the kernel attaches the same time stamps to its
+        // datagrams.
         let (tx, rx) = (UdpSocket::bind("127.0.0.1:0").unwrap(), UdpSocket::bind("127.0.0.1:0").unwrap());
         tx.connect(rx.local_addr().unwrap()).unwrap();
         let frames = [1, 2, 3].map(|id| Frame::classic(CanId::Standard(id), &[7, 8]).unwrap());

@@ -108,7 +108,7 @@ pub(super) struct Form {
     pub(super) separator: u8,
     /// Offset of the header line in the head.
     pub(super) start: usize,
-    /// Whether the score has found the header.
+    /// Whether the header line was recognised. If not, `start` is the first line.
     pub(super) is_known: bool,
 }
 
@@ -132,7 +132,7 @@ pub(super) fn form(head: &[u8], score: &dyn Fn(&[String]) -> usize) -> Form {
                 let fields = split(line, separator);
                 (score(&fields), separator)
             });
-            // If scores are equal, the first separator counts.
+            // If several separators have the highest score, the first of them is used.
             let best = rated.rev().max_by_key(|&(score, _)| score);
             if let Some((_, separator)) = best.filter(|&(score, _)| score > 0 || announced == Some(number)) {
                 return Form { separator, start, is_known: true };
@@ -145,7 +145,8 @@ pub(super) fn form(head: &[u8], score: &dyn Fn(&[String]) -> usize) -> Form {
     first.unwrap_or(Form { separator: b',', start: 0, is_known: false })
 }
 
-/// Line number of the header that a line of an EC-Lab preamble states: `Nb header lines : 98`.
+/// Parses the line `Nb header lines : 98` of an EC-Lab preamble. Returns the number, which is the line number of the
+/// header.
 fn announced_header(line: &[u8]) -> Option<usize> {
     let text = String::from_utf8_lossy(line);
     text.trim().strip_prefix("Nb header lines")?.trim_start_matches([' ', ':', '\t']).trim().parse().ok()
@@ -177,7 +178,7 @@ pub(super) fn join_quoted(parts: &[&[u8]], separator: u8) -> Vec<Vec<u8>> {
     let mut fields = Vec::new();
     let mut rest = parts;
     while let [first, after @ ..] = rest {
-        // The search ends before the next part that opens a quote, so its time is linear.
+        // The search ends at the next part with an odd number of quotes, so the total time is linear.
         let end = opens_quote(first).then(|| after.iter().position(|part| has_odd_quotes(part))).flatten();
         let end = end.filter(|&end| after[end].trim_ascii_end().ends_with(b"\""));
         let (field, after) = rest.split_at(end.map_or(1, |end| end + 2));

@@ -111,7 +111,8 @@ impl Dice {
     }
 }
 
-/// A sender of authenticated commands. It uses the freshness that the daemon announces.
+/// A sender of authenticated commands. It uses the freshness (a counter against replayed commands) that the daemon
+/// announces.
 #[derive(Default)]
 pub(super) struct Sender {
     announced: u64,

@@ -1,4 +1,5 @@
-//! Checks the metrics of a sample document as text, and with promtool of the Prometheus project.
+//! Checks the metrics of a sample status document: their text, and whether promtool of the Prometheus project accepts
+//! them.
 
 use std::io::Write as _;
 use std::process::{Command, Stdio};

@@ -170,7 +170,7 @@ fn pack(cells: u16) -> PackView {
     }
 }
 
-/// Adds loss modes and remaining life to `values`.
+/// Adds the loss modes (lost lithium and active material) and the remaining life to `values`.
 fn with_life<const IS_PACK: bool>(mut values: Values<IS_PACK>, lli: f64, cycles: f64) -> Values<IS_PACK> {
     for (quantity, mean, std) in [
         (Quantity::LithiumLoss, lli, Some(0.012)),

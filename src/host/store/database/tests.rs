@@ -1,4 +1,4 @@
-//! Tests commits, pack changes, and readers next to a writer, on real databases.
+//! Tests commits, pack changes, and reading while another connection writes, on real databases.
 
 use super::super::folder::DATABASE;
 use super::super::reader::{HistoryQuery, HistoryReader};
@@ -87,7 +87,7 @@ fn pack_change_closes_history_and_opens_next() {
         entries.iter().map(|entry| (entry.kind, entry.pack)).collect::<Vec<_>>(),
         [(HistoryTable::Reset, 1), (HistoryTable::Capacity, 2)]
     );
-    // The stored state contains a later pack number than the database.
+    // If the stored state has a later pack number (5) than the database, the database continues with this number.
     let path = folder.path().join(DATABASE);
     assert_eq!(Database::open(&path, &Stamp::replayed(Timestamp::ZERO), 5).unwrap().pack(), 5);
     assert_eq!(open(folder.path()).pack(), 5);

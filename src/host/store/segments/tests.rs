@@ -11,7 +11,7 @@ use crate::config::StoreConfig;
 use crate::monitor::EventKind;
 use crate::quantity::{DAY_S, Timestamp};
 
-/// A folder in memory if the system has one, because a commit needs several syncs.
+/// A folder in memory if the system has one, because a commit needs several syncs, which are slow on a disk.
 fn place() -> tempfile::TempDir {
     tempfile::tempdir_in("/dev/shm").unwrap_or_else(|_| tempfile::tempdir().unwrap())
 }
@@ -103,7 +103,8 @@ fn history_beyond_limit_loses_oldest_days() {
     let extent = reader.extent().unwrap();
     assert_eq!((extent.half_cycles, extent.deleted_half_cycles, extent.written_half_cycles), (20, 80, 100));
     assert_eq!(reader.entries(&HistoryQuery::default()).unwrap().len(), 200);
-    // The noted end of each day matches, even if its rows were deleted.
+    // The end of the chain was noted after each day. It still matches the history, even if the rows of the day were
+    // deleted.
     for (rows, hash) in heads {
         assert_eq!(reader.contradiction(&NotedHead { rows, hash }).unwrap(), None, "{rows}");
         let other = NotedHead { rows, hash: "0".repeat(64) };

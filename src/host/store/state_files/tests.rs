@@ -3,7 +3,7 @@
 use super::super::tests::document;
 use super::*;
 
-/// A folder in memory if the system has one, because a write needs several syncs.
+/// Creates a folder in memory if the system has one, because each write syncs several times, which is slow on a disk.
 fn place() -> tempfile::TempDir {
     tempfile::tempdir_in("/dev/shm").unwrap_or_else(|_| tempfile::tempdir().unwrap())
 }
@@ -27,7 +27,7 @@ fn states_are_written_alternately_newest_is_read() {
     let place = place();
     assert_eq!(found(place.path()), (None, None, 0));
     for pack in 1..=5 {
-        // The files are opened again between two states, as after a start.
+        // Between two states, the files are closed and opened again, as after a restart of the daemon.
         drop(written(place.path(), [pack]));
         assert_eq!(found(place.path()), (Some(pack), None, 0));
     }

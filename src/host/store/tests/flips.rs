@@ -1,5 +1,5 @@
-//! Flips single bits of a small store. After each flip, the store can be written again, and the learned capacity
-//! survives.
+//! Flips single bits of a small store. After each flip, it must still be possible to write the store, and the learned
+//! capacity must survive.
 //!
 //! By default, the test flips a sample of the bits. `PACKWATCH_FLIPS=all` tests every bit, `PACKWATCH_FLIPS=N` every
 //! N-th bit.
@@ -64,7 +64,8 @@ impl Reference {
         });
         std::fs::remove_file(state.join(newest_file.unwrap())).unwrap();
         let states = [json(&newest.snapshot), json(&stored(&state).snapshot)];
-        // Writes the next state and reads it back. The test later compares it with a state that was read from a file.
+        // Writes the next state and reads it back. The test later compares it with states that were read from files,
+        // and a file contains rounded numbers.
         StateFiles::open(&state).0.write(document(2, 100, 1_900_000_000)).unwrap();
         let next = stored(&state);
         let entries = HistoryReader::open(&state).unwrap().entries(&HistoryQuery::default()).unwrap();

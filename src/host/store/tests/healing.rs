@@ -1,4 +1,4 @@
-//! Tests what a start recovers from a store without states, and what it must not restore.
+//! Tests what the daemon recovers at its start if the store has no valid saved state, and what it must not restore.
 
 use super::folder::Folder;
 use super::rows::tests::capacity;
@@ -6,7 +6,7 @@ use super::*;
 use crate::alarm::{AlarmState, Change, Rule, Severity};
 use crate::monitor::{EventKind, LearnedCell};
 
-/// A store in a new folder, and the final state of its replay.
+/// Records a replay in a store in a new folder. Returns the folder and the final state of the replay.
 fn replayed_store() -> (tempfile::TempDir, Snapshot) {
     let place = tempfile::tempdir().unwrap();
     let state = place.path().join("state");
@@ -127,7 +127,7 @@ fn change(change: Change, occurrences: u32, acknowledged: bool) -> EventKind {
     }
 }
 
-/// Starts the store in a copy of the folder, as after a power cut.
+/// Copies the folder and opens the store in the copy, as after a power cut.
 fn after_cut(place: &Path) -> StoredStates {
     let copy = tempfile::tempdir().unwrap();
     for entry in std::fs::read_dir(place.join("state")).unwrap() {

@@ -41,7 +41,8 @@ fn channel_of(raw: &RawTables, message: &Message, signal: &Signal) -> Option<Cha
     } else if is(PackQuantity::Temperature) && label.is_of_pack() && !label.is_of_other_part() {
         Some(Channel::Temperature(SensorIndex(0)))
     } else {
-        // A signal that cannot exceed half of the range contains only the decimal places of a state of charge.
+        // A state of charge must be able to exceed half of its range. A signal with a smaller range contains only the
+        // decimal places of a state of charge.
         let highest = signal.layout.extent().1;
         let is_whole = highest > 50.0 || signal.unit.is_empty() && (0.9..=1.5).contains(&highest);
         (is(PackQuantity::Soc) && is_whole && !label.is_of_low_voltage()).then_some(Channel::ReportedSoc)

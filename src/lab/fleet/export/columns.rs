@@ -74,7 +74,7 @@ pub(super) struct Column<R> {
 
 enum ColumnSource<R> {
     Value(for<'r> fn(&'r R) -> FieldValue<'r>),
-    /// A number in the event that has the name of the column.
+    /// A field of the event. The name of the field is the name of the column.
     Field(fn(&R) -> &Fields),
     /// A value of the pack.
     Quantity(Quantity, Part, fn(&R) -> &RecordedPackValues),

@@ -51,7 +51,7 @@ pub(super) struct OutlookRow {
 
 pub(super) struct UseRow {
     pub(super) log: Arc<str>,
-    /// Path of the number in the record, such as `rest.above_80_s`.
+    /// Path of the number in the record of the pack's use, such as `rest.above_80_s`.
     pub(super) counter: String,
     pub(super) value: f64,
 }

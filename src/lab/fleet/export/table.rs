@@ -1,7 +1,7 @@
 //! Writes a table of rows as a Parquet or CSV file.
 //!
-//! Memory holds the rows of one row group. The file gets its final name when it is complete ([`ResultFile`]). In a
-//! Parquet file, a missing required value or a value of the wrong type is an error.
+//! Only the rows of one row group are in memory. The file gets its final name when it is complete ([`ResultFile`]). In
+//! a Parquet file, a missing required value or a value of the wrong type is an error.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -21,7 +21,8 @@ use crate::error::LabError;
 use crate::io::result_file::ResultFile;
 use crate::io::stamp;
 
-/// Number of rows of a row group. Estimates then need about 10 MB of memory, and readers can skip row groups.
+/// Number of rows of a row group. With this number, a table of estimates needs about 10 MB of memory, and readers can
+/// skip row groups.
 const GROUP_ROWS: usize = 65_536;
 
 pub(super) struct TableFile<R: 'static> {

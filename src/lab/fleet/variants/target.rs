@@ -17,11 +17,11 @@ pub(super) enum Target {
     Threshold { rule: Rule, severity: &'static str, part: &'static str },
     /// Another key of all `[[alarm]]` tables of a rule.
     Alarm { rule: Rule, key: &'static str },
-    /// Any other key: its parts, each with its number in brackets, if it has one.
+    /// Any other key: its parts. If a part has a number in brackets, the number is included.
     Key(Vec<(String, Option<usize>)>),
 }
 
-/// Finds what the choices refer to. Adds their rules to `grid`.
+/// Finds what the choices (the `--set` options) refer to. Adds their rules to `grid`.
 pub(super) fn targets(grid: &mut VariantGrid, root: &Table, choices: &[Choice]) -> Result<Vec<Target>, String> {
     let mut targets: Vec<Target> = Vec::new();
     for choice in choices {
@@ -152,7 +152,7 @@ fn set_threshold(root: &mut Table, rule: Rule, severity: &str, part: &str, value
     }
     let Some(alarm) = alarms_of(root, rule).nth(place) else { return Err(format!("no [[alarm]] of {}", rule.name())) };
     match (alarm.get_mut(severity), part) {
-        // Of the pair `set` and `clear`, only one value is replaced.
+        // If the alarm has a pair `set` and `clear`, only the chosen one of these values is replaced.
         (Some(Value::Table(both)), part) => {
             both.insert(part.to_owned(), value.clone());
         }

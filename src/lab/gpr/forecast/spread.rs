@@ -1,5 +1,6 @@
-//! Calibrates the local width of an interval on forecasts with known errors. The lag window of such a forecast is
-//! called a judged window.
+//! Calibrates the local width of an interval on forecasts with known errors. The window of a forecast contains the row
+//! and the preceding rows from which the forecast is made. If the error of the forecast is known, its window is called
+//! a judged window.
 //!
 //! The errors of a cell's voltage are tiny during a charge at constant voltage and large at the end of a discharge. A
 //! single width would be too wide in the charge and too narrow at the end of the discharge. The width is therefore
@@ -27,7 +28,7 @@ const FEWEST: usize = 100;
 pub(super) struct Spread {
     pub(super) factor: f64,
     width: usize,
-    /// Rows of the judged windows, rising. The ratios are in the same order.
+    /// Rows of the judged windows, in rising order. The ratios are in the same order.
     rows: Vec<usize>,
     ratios: Vec<f64>,
     mean: f64,

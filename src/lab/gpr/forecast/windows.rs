@@ -1,5 +1,5 @@
-//! Finds the rows of a table that have a lag window. The lag window of a row contains, for each column, the value and
-//! the latest differences.
+//! Finds the rows of a table that have a lag window (the inputs of a forecast from this row). The lag window of a row
+//! contains, for each column, the value in this row and the latest differences between consecutive rows.
 
 use super::super::ColumnTable;
 
@@ -9,7 +9,8 @@ pub struct LagWindows<'a> {
     table: &'a ColumnTable,
     columns: usize,
     lags: usize,
-    /// First row of each row's part (an independent section of the table), and first row after this part.
+    /// For each row: the first row of its part (an independent section of the table), and the first row after this
+    /// part.
     part: Vec<(usize, usize)>,
 }
 
@@ -23,7 +24,8 @@ pub struct RowSpacing {
 }
 
 impl RowSpacing {
-    /// Returns the steps of a time column within the parts of the table; `None` = no part has two consecutive times.
+    /// Returns the spacing of a time column. Steps from one part of the table to the next do not count. `None` = no
+    /// part has two consecutive times.
     pub fn of(table: &ColumnTable, column: usize) -> Option<Self> {
         let times: Vec<f64> = table.column(column).collect();
         let steps = (1..times.len()).filter(|row| table.parts.binary_search(row).is_err());
@@ -55,8 +57,8 @@ impl<'a> LagWindows<'a> {
         self.columns * self.lags
     }
 
-    /// Returns the rows from `begin` on that have a window. The row `steps` ahead must be in the same part and before
-    /// `end`.
+    /// Returns the rows from `begin` on that have a window and a row to forecast: the row `steps` later must be in the
+    /// same part and before `end`.
     pub fn between(&self, begin: usize, end: usize, steps: usize) -> Vec<usize> {
         let fits = |row: &usize| {
             let (first, last) = self.part[*row];

@@ -149,7 +149,8 @@ fn known_parameters_are_recovered_from_noisy_data() {
     let grid = grid();
     let truth = truth();
     let records: Vec<Record> = [5.0, 25.0].iter().map(|&t| simulate(&truth, t, 0.002, &grid)).collect();
-    // Each second has weight 10, because white noise averages out faster than the errors of real data.
+    // Each second has a weight of 10. This is more than for real data, whose errors average out more slowly than white
+    // noise.
     let fitted = fit(&settings(grid.clone()), &records, &[10.0, 10.0], |_, _| {}).expect("a fit");
     assert!(fitted.converged && fitted.total.rmse_v < 0.002, "{:?}", fitted.total);
     let expected = truth_theta(&grid);

@@ -9,11 +9,14 @@
 //! | concentration of the electrolyte | `2 R T (1 - t)^2 / (F^2 A c) (L_n / 3 D_n + L_s / D_s + L_p / 3 D_p)` | `sum(L / D) sum(e L) / pi^2` | Marquis et al., eq. 40; slowest mode of a layer without exchange at its ends |
 //! | diffusion in a particle, each electrode | `abs(dU/dx) r / (5 D F c_max S)` | `r^2 / 35 D` | sphere under constant flux; first moment of its step response |
 //!
-//! `S` is the surface of all particles of an electrode, `A` the area of all electrode pairs. In the row of charge
-//! transfer, `k` is the rate constant. In the rows of the electrolyte, `k` and `D` of a layer are the values of the
-//! electrolyte, multiplied by the layer's transport efficiency. Each property follows Arrhenius' law with its stated
-//! activation energy or with [`USUAL_J_PER_MOL`]. Charge transfer has no time constant because BPX has no double layer,
-//! which matters only for about 0.1 s.
+//! `S` is the surface of all particles of an electrode, `A` the area of all electrode pairs. `L` is the thickness of a
+//! layer: negative electrode (n), separator (s) or positive electrode (p). `x` is the lithium content of a particle and
+//! `r` its radius. `s_n` and `s_p` are the conductivities of the electrodes. `c` is the concentration of the
+//! electrolyte, `t` its transference number, and `e` the porosity of a layer. In the row of charge transfer, `k` is the
+//! rate constant. In the rows of the electrolyte, `k` and `D` of a layer are the conductivity and the diffusivity of
+//! the electrolyte, multiplied by the layer's transport efficiency. Each property follows Arrhenius' law with its
+//! stated activation energy or with [`USUAL_J_PER_MOL`]. Charge transfer has no time constant because BPX has no double
+//! layer, which matters only for about 0.1 s.
 
 use super::curve::Curve;
 use super::document::{BpxCell, Electrode, Layer, Transport};

@@ -150,7 +150,8 @@ impl<'a> Curve<'a> {
     }
 }
 
-/// Returns an interval around `near` in which the predicate changes from true to false; `ends` = there is none.
+/// Returns an interval around `near` in which the predicate changes from true to false. If there is none, returns
+/// `ends`.
 fn bracket(near: f64, ends: (f64, f64), is_below: impl Fn(f64) -> bool) -> (f64, f64) {
     let mut step = 1e-4;
     while step < 1.0 {

@@ -15,7 +15,8 @@ type Fault = (String, String);
 pub(super) enum Function {
     Constant(f64),
     Expression(Expression),
-    /// Points with rising `x`. Values between and outside the points are linear, as in PyBaMM.
+    /// Points with rising `x`. Between and outside the points, values are interpolated and extrapolated linearly, as in
+    /// PyBaMM.
     Table(Vec<(f64, f64)>),
 }
 

@@ -7,7 +7,8 @@ use serde_json::{Value, json};
 use super::*;
 use crate::cell::CellModel;
 
-/// Creates a cell with straight potentials: `u_p = 5 - y`, `u_n = 1 - x`, so the voltage is `4 + x - y`.
+/// Creates a cell whose electrodes have straight potential curves: `u_p = 5 - y`, `u_n = 1 - x`, so the voltage is
+/// `4 + x - y`. x and y are the lithium contents of the negative and the positive electrode.
 fn straight() -> Value {
     let electrode = |ocp: &str, low: f64, high: f64| {
         json!({
@@ -67,8 +68,8 @@ fn electrode_ah() -> f64 {
 
 #[test]
 fn straight_potentials_give_a_straight_curve() {
-    // The electrodes are equal, so x + y = 1.1. Therefore x = 0.8 at 4.5 V and x = 0.2 at 3.3 V. The stated minimum of
-    // x has no effect.
+    // Both electrodes have the same capacity, so x + y is constant (1.1). With the voltage 4 + x - y, this gives
+    // x = 0.8 at 4.5 V and x = 0.2 at 3.3 V. The minimum of x that the file states has no effect.
     let model = model_of(&straight());
     assert!((model.capacity_ah - 0.6 * electrode_ah()).abs() < 1e-4, "{}", model.capacity_ah);
     for soc in [0.0, 0.13, 0.5, 0.99, 1.0] {
@@ -116,8 +117,8 @@ fn single_particle_resistances_match_the_closed_forms() {
         assert!((model.branch_r_ohm(branch, &position) / diffusion - 1.0).abs() < 1e-3);
         assert!((model.branch_tau_s(branch, &position) / (25e-12 / 35e-14) - 1.0).abs() < 1e-3);
     }
-    // The table has a row 15 K below the reference temperature. There, R0 changes by Arrhenius' law with 40 kJ/mol and
-    // by R T / F.
+    // The table has a row 15 K below the reference temperature. R0 is larger there by the Arrhenius factor (40 kJ/mol),
+    // and changes with the factor R T / F of the charge transfer.
     let colder = model.r0_ohm(&model.grid_position(0.5, 10.0)) / model.r0_ohm(&position);
     let law = (40_000.0 / GAS_J_PER_MOL_K * (1.0 / 283.15 - 1.0 / 298.15)).exp() * 283.15 / 298.15;
     assert!((colder / law - 1.0).abs() < 1e-3, "{colder} {law}");

@@ -67,7 +67,7 @@ fn contact_from_the_beginning_differs_from_one_that_grows() {
     assert_eq!(grown.condition, Condition::Plan);
     let late = [found(CellFaultKind::Contact, 9, 0.2, 15.0)];
     assert!(of(&late, 0.19).what.contains("comes loose"));
-    // A store does not contain the first size.
+    // The history in a store does not contain the size at the first report.
     assert!(list(&contacts, &record(&[], 0.0))[0].what.ends_with("Whether the resistance grows is not known yet."));
 }
 

@@ -13,7 +13,7 @@
 //!
 //! Overlay booleans begin with `Is`, as VSS recommends. No overlay signal has a temperature unit, because the unit's
 //! name changed between VSS 5 and VSS 6. No overlay signal has a list of allowed values: the databroker (0.7) checks
-//! even an unknown value against the list, and would keep the last value.
+//! even "no value" against such a list. It would reject "no value" and keep the last value.
 
 use packwatch_host::quantity::catalogue::Quantity;
 use packwatch_host::quantity::{CellIndex, Mode};

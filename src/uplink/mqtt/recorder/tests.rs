@@ -16,7 +16,8 @@ fn queue(folder: &tempfile::TempDir) -> Queue {
     Queue::open(&HistorySettings { folder: folder.path().to_owned(), ..HistorySettings::default() }).unwrap()
 }
 
-/// Seconds of the documents that became samples.
+/// Passes status documents with the times `seconds` to a recorder. Returns the times of the documents that were queued
+/// as samples.
 fn sampled(period_s: u64, seconds: &[f64]) -> Vec<f64> {
     let folder = tempfile::tempdir().unwrap();
     let queue = queue(&folder);
@@ -44,7 +45,7 @@ fn schedule_restarts_after_pause_or_clock_step() {
     assert_eq!(sampled(10, &[1000.0, 1005.0, 100.0, 105.0, 110.0]), [1000.0, 100.0, 110.0]);
 }
 
-/// Numbers of the queued events in order. -1 stands for a restart of the daemon, -1000 N for N missed events.
+/// Numbers of the queued events in order. -1 stands for a restart of the daemon, -1000 times N for N missed events.
 fn queued(queue: &Queue) -> Vec<i64> {
     let number = |body: &str| {
         let event: Value = serde_json::from_str(body).unwrap();
@@ -57,7 +58,8 @@ fn queued(queue: &Queue) -> Vec<i64> {
     queue.oldest(Class::Event, 10_000).unwrap().iter().map(|queued| number(&queued.body)).collect()
 }
 
-/// A document of the run `started` that lists the events `first..=last`.
+/// A status document that lists the events `first..=last`, from the run of the daemon that started at the time
+/// `started`.
 fn with_events(started: i64, first: i64, last: i64) -> StatusDocument {
     let mut document = document(START as f64);
     document.started = Timestamp::from_nanos(started);
@@ -69,7 +71,7 @@ fn with_events(started: i64, first: i64, last: i64) -> StatusDocument {
 #[test]
 fn each_event_is_queued_once_or_counted() {
     for (documents, events, missed) in [
-        // On the first start, events that are no longer listed are not counted.
+        // On the first start, events that the document no longer lists do not count as missed.
         (&[(1, 5, 9)][..], &[5, 6, 7, 8, 9][..], 0),
         (&[(1, 1, 0), (1, 1, 2), (1, 1, 2), (1, 2, 4)], &[1, 2, 3, 4], 0),
         (&[(1, 1, 2), (1, 67, 98)], &[&[1, 2, -64_000][..], &(67..=98).collect::<Vec<_>>()].concat(), 64),

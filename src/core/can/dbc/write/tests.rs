@@ -52,7 +52,7 @@ fn quotes_in_text_are_escaped() {
     assert_eq!(Database::parse(&read.to_dbc()).unwrap(), read);
 }
 
-/// Text without quotation marks and backslashes, because writing changes these characters.
+/// Pattern of texts without quotation marks and backslashes, because writing changes these characters.
 const TEXT: &str = "[ -!#-\\[\\]-~\u{b0}\u{b5}\u{20ac}]{0,12}";
 
 fn layouts() -> impl Strategy<Value = SignalLayout> {
@@ -89,7 +89,8 @@ prop_compose! {
     }
 }
 
-/// The condition of a signal (an earlier multiplexor and ranges of its code), and whether the signal is a multiplexor.
+/// The condition under which a signal is present (an earlier multiplexor and ranges of its code), and whether the
+/// signal itself is a multiplexor.
 type MuxLink = (Option<(prop::sample::Index, Vec<(u64, u64)>)>, bool);
 
 fn mux_links() -> impl Strategy<Value = MuxLink> {
@@ -99,7 +100,8 @@ fn mux_links() -> impl Strategy<Value = MuxLink> {
     (condition, any::<bool>())
 }
 
-/// The nesting stays below the parser's limit.
+/// Joins signals and their conditions to the signals of a message. The nesting of multiplexors stays below the parser's
+/// limit.
 fn assemble(parts: Vec<(Signal, MuxLink)>) -> Vec<Signal> {
     let mut made: Vec<Signal> = Vec::new();
     for (number, (mut signal, (condition, is_multiplexor))) in parts.into_iter().enumerate() {

@@ -11,7 +11,7 @@ const LAST: u8 = 7;
 enum State {
     /// No frame was accepted yet.
     Waiting,
-    /// The last frame was valid. The next call allows a step of 2.
+    /// The last frame was valid. The next call accepts a counter step of up to 2.
     Following,
     /// The sequence is broken, and 2 more valid frames are required.
     Syncing,
@@ -165,7 +165,7 @@ fn lost_frames_are_accepted_up_to_allowed_step() {
 fn profile_1_without_sync_waits_for_sender_counter() {
     let config = config(Profile::P01A, 0);
     let mut receiver = in_state(State::Following);
-    // The sender is 6 ahead. Its counter grows by 1 per frame, as fast as the allowed step.
+    // The sender's counter is 6 ahead. It grows by 1 per frame, and so does the largest allowed step.
     let statuses: Vec<_> = (0..11).map(|n| receiver.check(&config, &frame(&config, (LAST + 6 + n) % 15))).collect();
     assert!(statuses[..9].iter().all(|status| *status == Status::WrongSequence), "{statuses:?}");
     assert_eq!(statuses[9..], [Status::Repeated, Status::Ok]);

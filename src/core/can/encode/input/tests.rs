@@ -57,7 +57,7 @@ fn messages_and_pages_decode_to_encoded_values() {
     let found = round_trip(&map(), &values);
     for (channel, wanted) in &values {
         let readings: Vec<_> = found.iter().filter(|(name, _)| name == channel).collect();
-        // The temperature is on both pages.
+        // The second temperature is on both pages of the multiplexed message, so it is received twice.
         assert_eq!(readings.len(), if *channel == sensor(1) { 2 } else { 1 }, "{channel:?}");
         assert!(readings.iter().all(|(_, value)| near(*value, wanted.unwrap(), 1e-9)), "{channel:?}: {readings:?}");
     }
@@ -108,7 +108,8 @@ fn missing_value_without_code_is_encoded_as_invalid() {
 
 #[test]
 fn frame_without_code_for_missing_is_omitted_and_counted() {
-    // Each code of the third cell's signal is a valid voltage. If this voltage is missing, its page cannot be sent.
+    // Every raw code of the third cell's signal is a valid voltage, so no code can say that the voltage is missing.
+    // Without this voltage, the multiplexer page with the signal cannot be sent.
     let (frames, lost) = encode(&map(), &[(sensor(1), Some(1.0))]);
     assert_eq!((frames.len(), lost), (1, 0));
     let two = InputMap::new(vec![bind("Cells.Cell3", cell(2)), bind("Cells.Air", sensor(1))]);

@@ -54,7 +54,7 @@ struct Bench {
     frames: Vec<(i64, Frame)>,
     events: Vec<NodeEvent>,
     messages: Vec<Message>,
-    /// Group, number of bytes, bytes received so far.
+    /// The running transfer: parameter group number, total number of bytes, bytes received so far.
     transfer: Option<(u32, usize, Vec<u8>)>,
 }
 
@@ -71,7 +71,7 @@ impl Bench {
         }
     }
 
-    /// Starts the node. The address is claimed 300 ms later, at 250 ms.
+    /// Starts the node at -50 ms. 300 ms later, at 250 ms, the node has its address.
     fn start(&mut self) {
         self.now_ms = -50;
         self.node.start(at(-50), &mut self.out);

@@ -1,7 +1,8 @@
-//! Stores the filters of a pack in blocks of [`WIDTH`] lanes, one cell per lane, and computes the steps of a batch.
+//! Stores the filters of a pack in blocks of [`WIDTH`] lanes, one cell per lane, and computes a batch of steps (at most
+//! one step per cell).
 //!
-//! In: inputs of the blocks. Out: changed states, and results. If a result is not usable, the step is added to
-//! `others`.
+//! In: inputs of the blocks. Out: changed states, and results. If the result of a step is not usable, the step is added
+//! to `others`, and the caller computes it again on its own.
 
 use std::array::from_fn;
 
@@ -90,7 +91,8 @@ impl<const N: usize, const T: usize, const W: usize> BatchStep<'_, N, T, W> {
     pub(super) fn run<const WIDE: bool>(self) {
         self.lanes.step::<WIDE>(self.constants, self.inputs, self.cells, self.results);
         for (block, input) in self.inputs.iter_mut().enumerate().filter(|(_, input)| input.is_present.any()) {
-            // The outcome was not usable, so the bank computes the step again as a step that is not ordinary.
+            // `is_present` is still set if the outcome of a step was not usable. The bank then computes the step again
+            // on its own, with the handling of special cases.
             for lane in 0..WIDTH {
                 if input.is_present.lane(lane) {
                     input.is_present.set_lane(lane, false);

@@ -1,8 +1,8 @@
-//! Collects the inputs of a block of cells, and records the results of their steps. Each cell has one lane of the
-//! block.
+//! Collects the inputs of a block of cells for the filter's vector code ([`super::kernel`]), and records the results of
+//! their steps. Each cell has one lane of the block.
 //!
-//! In: steps (V, A, s, degrees C). Out: the inputs of the kernel. If the outcome of a step is not usable,
-//! [`BlockInput::step`] returns the step, so that it can be computed again.
+//! In: steps (V, A, s, degrees C). Out: the inputs of the kernel. If the kernel's outcome for a cell is not usable,
+//! [`BlockInput::step`] returns the cell's step, so that the bank can compute this step again, alone.
 
 use super::kernel::{DecayFactors, StepInput, StepOutcome};
 use crate::cell::estimator::memory::Memory;
@@ -16,14 +16,15 @@ pub(super) const WIDTH: usize = 8;
 /// Data of a cell, in addition to the data in its lane.
 #[derive(Debug, Clone)]
 pub(super) struct CellSlot {
-    /// Load, consistency, information, rest and evidence in this memory are out of date. Their present values are in
-    /// the lane.
+    /// The lane holds the present load, consistency, information, rest and evidence of the cell. Their copies in this
+    /// memory are out of date.
     pub(super) memory: Memory,
     pub(super) has_filter: bool,
 }
 
 impl CellSlot {
-    /// Whether a step with a continuously measured current can be ordinary (see [`super`]).
+    /// Whether the next step can be an ordinary step (defined in [`super`]), if the current is measured during the
+    /// whole step.
     #[inline]
     pub(super) fn is_ordinary(&self) -> bool {
         self.has_filter
@@ -109,7 +110,7 @@ impl StepInput<WIDTH> {
         }
     }
 
-    /// Records the outcome of the step of lane `lane`, which is in lane `from` of `outcome`.
+    /// Records the outcome of lane `lane`'s step. This outcome is in lane `from` of `outcome`.
     #[inline(always)]
     pub(super) fn note<const L: usize>(
         &self,

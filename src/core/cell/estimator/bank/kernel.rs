@@ -1,5 +1,5 @@
 //! Computes ordinary steps (see [`super`]) of L cells at once: a prediction over a measured time, and an update with a
-//! voltage within the gate.
+//! voltage that passes the gate (it is not rejected as implausible).
 //!
 //! The filter is described in [`estimator`](crate::cell::estimator), the circuit in [`crate::cell::circuit`]. The
 //! results agree with the textbook form up to rounding. These exact rearrangements save work:
@@ -78,7 +78,8 @@ pub(super) fn has_variances<const L: usize, const N: usize, const T: usize>(
     sum.is_finite() & least.above_number(0.0)
 }
 
-/// Whether a cell can have the state (see `Gaussian::is_possible`), and whether the evidence can be stored.
+/// Whether the state is physically possible (see `Gaussian::is_possible`), and whether the evidence is in the range
+/// that can be stored.
 #[inline(always)]
 fn is_possible<const L: usize, const N: usize, const T: usize>(x: &FilterState<L, N, T>) -> Mask<L> {
     let within = |value: Lanes<L>, bounds: Bounds| {

@@ -1,7 +1,8 @@
-//! Runs the kernel for one cell. The estimator uses it for steps that are not ordinary (see [`super`]).
+//! Runs the kernel, which is the vector code of the filter, for one cell. The estimator uses it for every step that is
+//! not ordinary, for example a step after a gap (see [`super`]).
 //!
-//! In: a copy of a cell's state and memory, and a step. Out: the changed copy. If the step cannot be computed, returns
-//! `None` and leaves state and memory unchanged.
+//! In: a step, and a copy of a cell's filter state and of its [`Memory`]. Out: the changed copy. If the step cannot be
+//! computed, returns `None` and leaves the copy unchanged.
 
 use super::filter_array::{FilterArrays, each_array};
 use super::kernel::{
@@ -49,7 +50,8 @@ impl<'a> SingleCell<'a> {
         self.predict((x, memory), &input, self.constants.process.soc_per_s)
     }
 
-    /// Predicts over the unmeasured time of a step with zero current. The caller adds the noise of the SOC.
+    /// Predicts over the part of a step in which the current was not measured, and assumes that no current flowed. The
+    /// caller adds the noise of the SOC.
     pub(in crate::cell::estimator) fn predict_unmeasured(
         &mut self,
         (x, memory): (&mut Gaussian, &Memory),
@@ -71,8 +73,9 @@ impl<'a> SingleCell<'a> {
         *memory = with_hot(memory, &hot);
     }
 
-    /// Updates with the voltage of a step whose current is known. If the voltage is within the gate, the state changes
-    /// and the evidence is added to the memory.
+    /// Updates with the voltage of a step whose current is known. If the voltage is within the gate, the state changes,
+    /// and the memory gains evidence about two errors: the offset of the current sensor, and the resistance ratio of
+    /// the slowest branch.
     pub(in crate::cell::estimator) fn update(
         &mut self,
         (x, memory): (&mut Gaussian, &mut Memory),

@@ -56,7 +56,7 @@ impl Pack {
         Self { model: model.clone(), dice: Dice(0x2545_F491_4F6C_DD1D), cells, current_a: 1.0, temperature_c: 20.0 }
     }
 
-    /// The steps at one time, without some of the cells.
+    /// The steps at one time. Some cells have no step.
     fn steps(&mut self, time: u32) -> Vec<(usize, CellStep)> {
         let dt_s = if time.is_multiple_of(7) { 0.25 } else { 1.0 };
         let low = self.cells.iter().any(|cell| cell.soc < 0.1);
@@ -161,8 +161,8 @@ fn differences<const N: usize>(model: &CellModel, config: &EstimatorConfig, roun
             (soc, others) = (soc.max(of_soc), others.max(of_others));
         }
         if time % 2500 == 1249 {
-            // At the end of a charge or discharge, the capacity of the curve changes. Both filters must then use the
-            // aged curve at every temperature and in every SOC interval.
+            // At the end of a charge or discharge, the learned capacity changes, and the open-circuit curve with it.
+            // Both filters must then use the aged curve at every temperature and in every SOC interval.
             for (cell, textbook) in textbooks.iter_mut().enumerate() {
                 let mean = model.capacity_ah * (0.95 - 0.02 * cell as f64);
                 let curve = ScalarGaussian { mean, ..bank.cell(cell).curve() };

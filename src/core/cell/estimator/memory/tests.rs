@@ -1,4 +1,4 @@
-//! Compares the memory of rest and load with closed formulas.
+//! Compares the estimator's memory of recent rest, load and gaps with closed formulas.
 
 use super::super::tests::config;
 use super::*;
@@ -23,8 +23,8 @@ fn near(a: f64, b: f64) -> bool {
     (a - b).abs() < 1e-9 * b.abs().max(1.0)
 }
 
-/// Computes a step without a known current, so its voltage is not used. Returns the time that counts as new information
-/// (s).
+/// Computes a step whose current is unknown, so that its voltage is not used. Returns how much time of the step counts
+/// as new information (s).
 fn new_information_s(estimator: &mut CellEstimator, step: CellStep) -> f64 {
     let before_s = estimator.memory.information_s;
     estimator.step(&small_model(), &config(), &CellStep { current_a: None, ..step });
@@ -43,7 +43,7 @@ fn rest_counts_logarithm_of_its_length() {
         let mut estimator = started();
         let steps = (36_000.0 / dt_s) as u32;
         let information_s: f64 = (0..steps).map(|_| new_information_s(&mut estimator, step(0.0, dt_s, 0.0))).sum();
-        // Ten hours at rest count as 3.6 times 1000 s.
+        // Ten hours of rest are 36 times 1000 s. They count as 1000 s times ln(1 + 36), which is 3.6 times 1000 s.
         assert!(near(information_s, 1000.0 * libm::log(1.0 + 36.0)), "{dt_s}: {information_s}");
     }
 }
@@ -96,13 +96,15 @@ fn possible_use_depends_on_load_and_gap_length() {
         let std = memory.note_gap(config, &step(current_a, 0.0, gap_s), 2.0);
         (std, memory.downtime_std, memory.used_prior)
     };
-    // In 900 s, 4 A on 2 Ah (2 C) move more charge than a charger with C/2.
+    // A load of 4 A (2 C, for 2 Ah) flows before the gap. If it continued for 900 s, it took out half of the capacity.
+    // That is more than a charger with C/2 supplies in this time.
     let (std, downtime_std, used) = after(&config, 4.0, 900.0);
     assert!(
         std == 0.0 && near(downtime_std, 0.5 / 3.0_f64.sqrt()) && near(used, LOADED_PRIOR),
         "{downtime_std} {used}"
     );
-    // At rest, a charger may have been connected. The probability is highest from half a day on, and 0 below an hour.
+    // The cell rests before the gap, but a charger may have been connected during the gap. The probability of this is 0
+    // for a gap below an hour, then grows, and is highest from half a day on.
     let (_, downtime_std, used) = after(&config, 0.0, 4320.0);
     assert!(near(downtime_std, 0.6 / 3.0_f64.sqrt()) && near(used, 0.1 * CHARGER_PRIOR), "{downtime_std} {used}");
     assert!([43_200.0, 604_800.0].iter().all(|&gap_s| near(after(&config, 0.0, gap_s).2, CHARGER_PRIOR)));

@@ -1,13 +1,15 @@
-//! Tests the estimator with wrong initial values, with an offset of the current sensor, and at rests during which the
-//! cell still relaxes. The simulated cell has a slow branch that the estimator's model lacks, and no noise.
+//! Tests the estimator with wrong initial values, with an offset of the current sensor, and during rests in which the
+//! cell's voltage still relaxes. The simulated cell has a slow RC branch that the estimator's model does not have. The
+//! simulated readings have no noise.
 
 use super::*;
 
 /// Time constant of the slow branch (s).
 const SLOW_TAU_S: f64 = 1500.0;
 
-/// Resistance of the slow branch (ohm): a fifth of the model's resistance. From 15 mohm on, the intervals would be too
-/// narrow, because the default model error of 0.15 V over one second does not cover an error that lasts for 1500 s.
+/// Resistance of the slow branch (ohm): a fifth of the model's resistance. With 15 mohm or more, the intervals would be
+/// too narrow: the estimator assumes a model error of 0.15 V over one second by default, and this does not cover an
+/// error that lasts for 1500 s.
 const SLOW_OHM: f64 = 0.01;
 
 /// Half of the width of a 95 % interval in standard deviations.
@@ -91,7 +93,8 @@ fn current_offset_does_not_drift_soc() {
     for offset_a in [-0.01, 0.01] {
         let worst = three_days(0.0, offset_a);
         assert!(worst.largest_error < 0.75, "{offset_a} A: {worst:?}");
-        // The interval does not include the offset, so it is up to a quarter too narrow for a permanent offset.
+        // The 95 % interval is calculated without the offset. With a permanent offset, it is up to a quarter too
+        // narrow.
         assert!(worst.largest_ratio < 1.25, "{offset_a} A: {worst:?}");
         let worst = three_days(SLOW_OHM, offset_a);
         assert!(worst.largest_error < 1.25, "with a slow branch, {offset_a} A: {worst:?}");
@@ -115,7 +118,7 @@ fn thirty_point_error_recovers_within_minutes() {
 #[test]
 fn interval_covers_error_while_cell_relaxes() {
     for current_a in [1.0, -1.0] {
-        // The filter starts together with the load, so it has never used a voltage at rest.
+        // The filter starts when the load starts, so it has never used a voltage at rest.
         let mut bench = Bench::new(0.5 + 0.3 * current_a, None, SLOW_OHM, 0.0);
         bench.run(current_a, 3600.0);
         let mut rested_s = 0.0;
@@ -126,7 +129,7 @@ fn interval_covers_error_while_cell_relaxes() {
         }
         // The slow branch has relaxed, so the voltage is the open-circuit voltage.
         assert!(bench.error_points().abs() < 0.5, "{current_a} A: {}", bench.error_points());
-        // Ten hours of rest count as 1000 s x ln 37 under load.
+        // Ten hours of rest give as much information as 1000 s x ln 37 (about an hour) under load.
         let least = 100.0 * STD_OF_95 * bench.config.voltage.model_error_v_sqrt_s / 1.2 / libm::sqrt(3600.0);
         assert!(bench.half_width_points() > least, "{current_a} A: {} {least}", bench.half_width_points());
     }

@@ -1,4 +1,5 @@
-//! The filter in its textbook form, as a reference for the kernel: every sigma point passes through the whole circuit.
+//! The filter in its textbook form, as a reference for the kernel (the vector code of the filter): here, every sigma
+//! point passes through the whole circuit.
 //!
 //! After a start, a downtime or learning, the textbook filter copies the state of the estimator under test. It computes
 //! all other steps by itself.
@@ -91,7 +92,7 @@ impl<const N: usize> Textbook<N> {
         Some(Some(update))
     }
 
-    /// Updates load, rest and information for the time of a step.
+    /// Advances the memory's load, rest time and information time by the duration of a step.
     fn pass_time(&mut self, model: &CellModel, config: &EstimatorConfig, step: &CellStep) {
         const REST_REPEATS_S: f64 = 1000.0;
         let memory = &mut self.memory;

@@ -1,6 +1,7 @@
-//! Predicts the voltages of a notebook's rows from the parameters of a fit, with derivatives.
+//! Predicts the voltages of rows (means of readings over a short time) from the parameters of a fit, with derivatives.
 //!
-//! In: parameters and rows. Out: V. A row's voltage is linear in the curve and in all resistances.
+//! In: parameters and rows. Out: voltages (V) and their derivatives. A row's voltage is linear in the curve and in all
+//! resistances.
 
 use nalgebra::{DMatrix, DVector};
 
@@ -11,11 +12,14 @@ use crate::cell::notebook::Row;
 use crate::cell::own_model::{FACTOR_NODES, OwnModel, SOC_NODES};
 use crate::filter::interpolation::{between, locate_clamped};
 
-/// Index of the first parameter of each group. The curve starts at index 0: difference from the label's curve (V) at
-/// the SOC breakpoints. [`FACTORS`]: ln of the resistance factors over SOC. [`BY_TEMPERATURE`]: relative deviation of
-/// each resistance's activation energy. [`COLD_SAG`]: difference from the label's sag of the curve in the cold (V).
-/// [`LOG_CAPACITY`]: ln of the capacity (Ah). [`OFFSET`]: offset of the current sensor (A, measured minus true).
-/// [`BEGINNINGS`]: SOC at the start of each stretch (a period with a continuously measured current).
+/// Index of the first parameter of each group. The groups are:
+/// * from index 0: the curve at the SOC breakpoints, as difference from the curve of the label's model (V);
+/// * [`FACTORS`]: ln of the resistance factors over SOC;
+/// * [`BY_TEMPERATURE`]: relative deviation of each resistance's activation energy;
+/// * [`COLD_SAG`]: how far the curve falls in the cold, as difference from the label's model (V);
+/// * [`LOG_CAPACITY`]: ln of the capacity (Ah);
+/// * [`OFFSET`]: offset of the current sensor (A, measured minus true);
+/// * [`BEGINNINGS`]: SOC at the start of each stretch (a period with a continuously measured current).
 pub(super) const FACTORS: usize = SOC_NODES;
 pub(super) const BY_TEMPERATURE: usize = FACTORS + RESISTANCES * FACTOR_NODES;
 pub(super) const COLD_SAG: usize = BY_TEMPERATURE + RESISTANCES;
@@ -30,7 +34,7 @@ pub(super) const BEGINNING: (f64, f64) = (-0.05, 1.05);
 pub(super) struct Basis<'a> {
     pub(super) model: &'a CellModel,
     pub(super) curve: &'a CurvePrior,
-    /// The expected model; `None` = the label's model.
+    /// The model that is expected before the fit; `None` = the label's model.
     expected: Option<&'a OwnModel>,
     pub(super) rows: &'a [Row],
     /// Stretch of each row, counted from 0.

@@ -1,7 +1,7 @@
-//! Computes the covariance of the errors of a notebook's rows, and the cost of residuals.
+//! Computes the covariance of the rows' errors, and the cost of residuals.
 //!
-//! In: predictions and rows (means of readings over a short time). Out: the normal equations of the whitened residuals,
-//! and their cost (minus the logarithm of their density).
+//! In: rows (means of readings over a short time) and their predictions. Out: the normal equations of the whitened
+//! residuals, and the cost of the residuals (minus the logarithm of their probability density).
 
 use nalgebra::{DMatrix, DVector};
 
@@ -118,7 +118,7 @@ fn covariance(predictions: &[Prediction], errors: &RepeatedErrors) -> DMatrix<f6
     let drop_v: Vec<f64> = predictions.iter().map(|it| it.drop_v * (1.0 + 3.0 * it.drop_v.abs())).collect();
     DMatrix::from_fn(predictions.len(), predictions.len(), |a, b| {
         let (x, y) = (&predictions[a], &predictions[b]);
-        // Repeating errors are correlated over 12 % of SOC.
+        // The errors that repeat at nearly the same SOC are correlated over 12 % of SOC.
         let near = bell((x.soc - y.soc) / 0.12);
         let of = |v: f64, soc: f64, drop: f64| {
             v * v + soc * soc * x.slope_v * y.slope_v + drop * drop * drop_v[a] * drop_v[b]

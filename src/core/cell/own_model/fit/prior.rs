@@ -32,9 +32,10 @@ pub(super) fn information(of: &LabelPrior, size: usize) -> Option<DMatrix<f64>> 
     (BY_TEMPERATURE..COLD_SAG).for_each(|i| near(i, 0.25 * log_ratio));
     near(COLD_SAG, of.cold_sag_std_v);
     near(LOG_CAPACITY, of.capacity_std);
-    // One standard deviation of the offset moves the rated capacity in 700 h.
+    // Standard deviation of the current sensor's offset: C/700.
     near(OFFSET, of.label.rated_ah / 700.0);
-    // SOC at the start of a stretch. The prior is wide, because the voltages determine this SOC.
+    // SOC at the start of each stretch (a period with a continuously measured current). The prior is wide, because the
+    // voltages determine this SOC.
     (BEGINNINGS..size).for_each(|i| near(i, 0.5));
     Some(prior)
 }

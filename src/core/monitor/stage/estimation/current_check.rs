@@ -19,10 +19,10 @@
 //! then only weak evidence.
 //!
 //! The check finds a current that is frozen, inverted, late or beyond the sensor's range, even if the last digits of
-//! its readings change. While the load is constant, it finds only a noisy sensor at its limit ([`SensorLimit`]). A
-//! current without sign is found at the first clear steps of a charging current. If a doubted current has flowed in
-//! only one direction, the doubt lasts until the current has flowed in both. A current without sign therefore stays
-//! doubtful.
+//! its readings change. While the load is constant, it finds only a current beyond the range of a noisy sensor
+//! ([`SensorLimit`]). A sensor that reports the current without its sign is found at the first clear steps of a
+//! charging current. If a doubted current has flowed in only one direction, the doubt lasts until the current has
+//! flowed in both. A current without sign therefore stays doubtful.
 
 mod sensor_limit;
 
@@ -168,7 +168,7 @@ pub(crate) struct CurrentCheck {
     /// Number of cells whose SOC has jumped since all cells last reported.
     #[serde(default)]
     jumped: usize,
-    /// Whether a jump of the SOC in a downtime waits for an explained step.
+    /// Whether the SOC has jumped in a downtime, and an explained step must still confirm the current.
     is_unconfirmed: bool,
     /// Whether the current was contradicted and has still not flowed in both directions.
     is_one_sided: bool,
@@ -419,7 +419,8 @@ impl CurrentCheck {
     }
 }
 
-/// The change that at least two thirds of the cells reach or exceed in the same direction (V); otherwise 0.
+/// The change that at least two thirds of the cells reach or exceed in the same direction (V); 0 = there is no such
+/// change.
 fn common_move(moves_v: &mut [f64]) -> f64 {
     moves_v.sort_unstable_by(f64::total_cmp);
     let Some(last) = moves_v.len().checked_sub(1) else { return 0.0 };

@@ -17,8 +17,8 @@ use crate::quantity::{BusIndex, Timestamp};
 pub(crate) const CAN_ERR_BUSOFF: u32 = 0x40;
 const CAN_ERR_RESTARTED: u32 = 0x100;
 
-/// If no report of unsent frames arrives for this time, sending counts as working again (s). The time is four report
-/// periods of the driver.
+/// If no report of unsent frames arrives for this time, sending counts as working again (s). The daemon's sockets report
+/// unsent frames every 0.25 s, so this is four report periods.
 const SEND_RECOVERED_S: f64 = 1.0;
 
 #[derive(Debug, Clone, Copy, Default, Serialize, Deserialize)]

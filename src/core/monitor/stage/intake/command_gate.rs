@@ -1,12 +1,16 @@
 //! Decides which authenticated command frames are executed.
 //!
-//! In: a command frame, and the freshness (counter value) for which its authenticator is correct, if any. Out:
+//! The sender of a command calculates its authenticator (a checksum with a secret key) from the command and a
+//! *freshness*. The freshness is a counter value that packwatch announces and accepts only once, so that a recorded
+//! command cannot be sent again.
+//!
+//! In: a command frame, and the freshness with which its authenticator is right (`None` if it is wrong). Out:
 //! permission to execute the command, or the reason for the refusal; the freshness to announce.
 //!
 //! With many attempts, an attacker can guess a short authenticator. After [`FORGED_BURST`] wrong authenticators, the
 //! gate is *under attack* for [`FORGED_PERIOD_NS`]. After this period, each further wrong authenticator starts another
-//! period. For every [`FORGED_PERIOD_NS`] without a wrong authenticator, the gate tolerates one more wrong
-//! authenticator.
+//! period. For every [`FORGED_PERIOD_NS`] without a wrong authenticator, the gate tolerates one more, up to
+//! [`FORGED_BURST`].
 //!
 //! During an attack, a command with a right authenticator is executed only if it is sent again within [`REPEAT_NS`],
 //! with another freshness. A genuine sender repeats a refused command, so its commands are executed even during an
@@ -18,17 +22,17 @@ use crate::can::encode::{CommandRefusal, FRESHNESS_PERIOD_MS};
 use crate::can::secoc::{Authentication, FreshnessWindow, MacCheck};
 use crate::quantity::{InvalidState, Timestamp};
 
-/// Number of wrong authenticators tolerated after a pause.
+/// Number of wrong authenticators that start an attack, if none was wrong for a long time before.
 const FORGED_BURST: i64 = 10;
-/// Time after which one more wrong authenticator is tolerated, ns. The probability that an attacker guesses an
-/// authenticator of 24 bits within a day is then 1 in 1900.
+/// Time after which one more wrong authenticator is tolerated, ns. With this time, the probability is 1 in 1900 that an
+/// attacker guesses an authenticator of 24 bits within a day.
 const FORGED_PERIOD_NS: i64 = 10_000_000_000;
 /// Longest time between a command and its repetition during an attack, ns. At 2000 guesses a second (the default flood
 /// limit), the probability is 1 in 800 that an attacker guesses an authenticator of 24 bits and its repetition within a
 /// day.
 const REPEAT_NS: i64 = 1_000_000_000;
 
-/// Age, ns, at which an announced freshness is outdated. It is two announcement periods.
+/// Age (ns) above which an announced freshness is outdated: two announcement periods.
 const STALE_NS: i64 = 2 * FRESHNESS_PERIOD_MS as i64 * 1_000_000;
 
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -38,7 +42,7 @@ pub(crate) struct CommandGate {
     announced_at: Timestamp,
     /// End of the time under attack, in which commands must be repeated.
     attacked_until: Timestamp,
-    /// A command that the sender must repeat, with the latest time of the repetition.
+    /// A command that the sender must repeat, and the time by which the sender must repeat it.
     unconfirmed: Option<(Timestamp, Vec<u8>)>,
     pub(crate) counts: CommandCounts,
 }
@@ -91,7 +95,7 @@ impl CommandGate {
         self.window.check(authentication, payload)
     }
 
-    /// Judges a frame. `verified`: the freshness for which its authenticator is correct.
+    /// Judges a frame. `verified` is the freshness with which the frame's authenticator is right; `None` = it is wrong.
     ///
     /// # Errors
     /// The reason why the command is not executed.

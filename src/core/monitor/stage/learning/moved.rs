@@ -26,7 +26,7 @@ pub struct MovedSums {
     pub discharged_wh: f64,
 }
 
-/// The sums, and charge not yet counted as energy because no voltage was known.
+/// The sums, and the charge that is not counted as energy yet, because no voltage has been read since it flowed.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct MovedCounter {

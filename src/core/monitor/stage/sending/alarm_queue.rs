@@ -22,8 +22,9 @@ use crate::quantity::{CellIndex, Timestamp};
 const BURST: i64 = 20;
 /// Shortest time between frames in turn, in units of [`ALARM_DELAY_MS`]. Half of the budget thus remains for changes.
 const TURN_DELAYS: u32 = 2;
-/// Maximum number of alarms that are announced as unknown: more than the 54 thresholds (18 rules, three severities).
-/// Further unknown alarms are not announced, but the digest shows their rules as unknown.
+/// Maximum number of alarms for which a frame announces that their state is unknown. It is more than the 54 thresholds
+/// (18 rules, three severities). Further unknown alarms are not announced, but the digest (the frame with the state of
+/// every rule) shows their rules as unknown.
 const MAX_UNKNOWN: usize = 64;
 
 const NANOS_PER_MS: i64 = 1_000_000;
@@ -152,7 +153,7 @@ impl AlarmQueue {
         if due > now || self.free > now {
             return None;
         }
-        // Makes up for the few turns that a late tick misses, but not for a longer pause.
+        // Missed turns are made up for, for example if a tick was late, but only those of the last `BURST` delays.
         let earliest = now.plus_nanos(-BURST * DELAY_NS);
         self.turn = Some(due.max(earliest).plus_nanos(step_ns));
         let keys = || engine.raised().map(|alarm| AlarmKey::of(&alarm));
@@ -224,9 +225,9 @@ impl AlarmQueue {
         self.changed.iter_mut().for_each(|changed| changed.due = changed.due.min(now));
     }
 
-    /// Limits each due time of a state that was stored at `stored` to one period after `now`. If time has passed since
-    /// the state was stored, the budget is used up at first, because an earlier process may have sent a burst just
-    /// before its end.
+    /// Corrects the due times of a queue that was stored at `stored` and is restored at `now`: no frame is due later
+    /// than one period after `now`. If time has passed since the queue was stored, the budget is used up at first,
+    /// because an earlier process may have sent a burst just before its end.
     pub(crate) fn limit(&mut self, stored: Timestamp, now: Timestamp, period_s: f64) {
         let least = if stored < now { now.plus_nanos(DELAY_NS) } else { self.free };
         self.free = least.min(now.plus_nanos(DELAY_NS));

@@ -32,8 +32,8 @@ impl J1939 {
         }
     }
 
-    /// Applies a configuration with other trouble codes. If the node itself differs, changes nothing and returns
-    /// `false`.
+    /// Applies a configuration with other trouble codes. If its interface or its node settings differ, changes nothing
+    /// and returns `false`.
     pub(crate) fn reconfigure(&mut self, config: &J1939Config) -> bool {
         let is_same = (self.config.bus, self.config.node) == (config.bus, config.node);
         if is_same {
@@ -80,7 +80,7 @@ impl J1939 {
                 self.previously_active.push(code);
             }
         }
-        // Restores the order by rule and severity, because the end of a list that is too long is cut off.
+        // Restores the order by rule and severity. The order matters, because a list that is too long loses its end.
         self.previously_active.reverse();
         if is_test_running {
             self.active.push(ActiveCode { code: self.config.test_code, lamp: Lamp::None });

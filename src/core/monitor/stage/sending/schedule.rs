@@ -7,12 +7,13 @@ use crate::can::encode::{FRESHNESS_PERIOD_MS, SendCounters};
 use crate::monitor::config::OutputConfig;
 use crate::quantity::Timestamp;
 
-/// Number of freshness values skipped at a start, because an earlier process may have sent frames after its state was
-/// stored. The driver stores the state before the first frame, and again when half of these values have been used. With
-/// up to 300 starts a day, the freshness stays below the clock's value ([`FRESHNESS_PER_S`]).
+/// Number of freshness values (counters of authenticated frames) skipped at a start, because an earlier process may
+/// have sent frames after its state was stored. The driver stores the state before the first frame, and again when half
+/// of these values have been used. With up to 300 starts a day, the freshness stays below the clock's value
+/// ([`FRESHNESS_PER_S`]).
 pub const RESTART_FRESHNESS: u64 = 1 << 16;
 /// At a start, the freshness is at least this value times the clock's time in seconds. The daemon sends fewer frames
-/// than this per second.
+/// than this per second, so the clock gives a higher value than earlier runs have used (see [`RESTART_FRESHNESS`]).
 const FRESHNESS_PER_S: u64 = 256;
 
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
@@ -21,7 +22,7 @@ pub(crate) struct Schedule {
     pub(super) status: Timestamp,
     pub(super) health: Timestamp,
     pub(super) alarm: Timestamp,
-    /// Counts the alarm periods; selects the unknown alarm that is announced next.
+    /// Counts the alarm periods; selects the alarm with an unknown value that is announced next.
     pub(super) alarm_turn: usize,
     pub(super) digest: Timestamp,
     /// Counts the digests; selects the threshold in the next digest.

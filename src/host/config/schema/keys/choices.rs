@@ -42,10 +42,10 @@ pub(crate) enum WireOrder {
     Little,
 }
 
-/// How the capacity is computed from the charge of a half-cycle.
+/// How the capacity is computed from the charge of a half-cycle (one charge or one discharge).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum MethodKey {
-    /// Charge divided by the SOC swing, which is computed from the voltages.
+    /// Charge divided by the change of the SOC (the swing), which is computed from the voltages.
     Swing,
     /// Charge divided by a configured swing.
     Nominal,

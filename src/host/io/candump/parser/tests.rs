@@ -7,9 +7,9 @@ use super::*;
 /// Text that follows the line in the log.
 const MORE: &str = "\n(1700000000.123456) can0 123#1122334455667788\n(1700000000.123457) can0 123#\n";
 
-/// Parses the line twice with a parser that knows the interface and is given more text after the line. In the second
-/// pass, the parser also remembers the seconds of the stamp. Both results must equal that of a new parser, which
-/// parses only this line and takes no fast path.
+/// Parses the line in two ways and checks that the results are equal. A new parser parses only this line and takes no
+/// fast path. Another parser knows the interface and gets more text after the line. It parses the line twice, because
+/// it remembers the seconds of the first stamp and then parses them faster.
 fn read(line: &[u8]) -> Result<Line<'_>, LineError> {
     let plain = crate::io::candump::parse_line(line);
     let name = match plain {
@@ -30,7 +30,7 @@ fn read(line: &[u8]) -> Result<Line<'_>, LineError> {
             }
             let is_short = name.as_bytes() == interface && (1..8).contains(&name.len());
             let number = BusIndex(u8::from(name != "none"));
-            // After more than one space the interface is looked up by name.
+            // If there is more than one space before the interface, the parser looks the interface up by its name.
             let has_more = line.windows(2).any(|two| two == b"  ");
             let is_right = head.bus.map_or(!is_short || has_more, |bus| is_short && bus == number);
             assert!(is_right, "{:?}", String::from_utf8_lossy(line));

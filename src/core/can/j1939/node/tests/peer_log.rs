@@ -10,8 +10,8 @@ fn code(spn: u32, fmi: u8, count: u32, lamp: Lamp) -> ActiveCode {
     ActiveCode { code: TroubleCode::new(spn, fmi, count).unwrap(), lamp }
 }
 
-/// Sends the claim, then DM1 with no, one, two, five and 27 codes, and DM1 with nothing known. Last, sends DM2 with no,
-/// one and three codes. Each step takes two seconds.
+/// Sends the address claim. Then sends DM1 with 0, 1, 2, 5 and 27 codes, and DM1 without codes while not all values are
+/// known. Last, sends DM2 with 0, 1 and 3 codes. Each step takes two seconds.
 fn played() -> Bench {
     let mut bench = Bench::new();
     bench.set(&[]);

@@ -1,4 +1,4 @@
-//! Tests properties of the node for any sequence of inputs.
+//! Tests properties of the J1939 node that must hold for any sequence of inputs.
 
 use std::collections::BTreeMap;
 
@@ -17,7 +17,7 @@ enum Act {
 }
 
 fn act() -> impl Strategy<Value = Act> {
-    // Identifiers that concern the node are chosen more often.
+    // Identifiers of messages to the node are chosen more often.
     let id = prop_oneof![
         Just(0x18EE_FFF9_u32),
         Just(0x18EA_F921),
@@ -49,7 +49,8 @@ fn lamp_of(number: u8) -> Lamp {
 fn perform(bench: &mut Bench, act: &Act) {
     match act {
         Act::Wait(ms) => {
-            // Simulates a driver that sleeps until something is due, but polls at most once a tick (here 1 ms).
+            // Simulates the program around the node: it sleeps until the node has something to send, but polls the node
+            // at most once a tick (here 1 ms).
             let (end, mut next_tick) = (bench.now_ms + i64::from(*ms), bench.now_ms);
             while let Some(due) = bench.node.next_due().filter(|due| *due <= at(end) && next_tick <= end) {
                 bench.now_ms = next_tick.max(due.nanos().saturating_add(999_999) / 1_000_000);
@@ -81,7 +82,8 @@ fn perform(bench: &mut Bench, act: &Act) {
     bench.take();
 }
 
-/// Gives the same inputs to two nodes. The first is polled only when something is due, the second every millisecond.
+/// Gives the same inputs to two nodes. Polls the first node only when it has something to send, and the second node
+/// every millisecond.
 fn sleeping_and_polled(acts: &[Act]) -> (Bench, Bench) {
     let (mut sleeper, mut busy) = (Bench::new(), Bench::new());
     for act in acts {
@@ -100,7 +102,8 @@ fn sleeping_and_polled(acts: &[Act]) -> (Bench, Bench) {
     (sleeper, busy)
 }
 
-/// During the transfer of a DM2, both codes leave the DM1, which then fits into one frame.
+/// While a long DM2 (previously active codes) is sent, both codes of the DM1 (active codes) become inactive. The DM1
+/// then fits into one frame.
 #[test]
 fn dm1_shortened_during_transfer_is_due() {
     let set = |spns: &[(u8, u8)], previously| Act::Set { spns: spns.to_vec(), previously, all_known: true };
@@ -138,7 +141,7 @@ proptest! {
                 prop_assert!(is_claim || !claims_only, "{frame:?} from a silent node");
                 prop_assert!(sent_ids.contains(&frame.id()));
             }
-            // The driver must neither spin nor sleep forever.
+            // The program around the node must neither poll without pause nor sleep forever.
             bench.node.poll(at(bench.now_ms), &mut bench.out);
             bench.take();
             if let Some(due) = bench.node.next_due() {

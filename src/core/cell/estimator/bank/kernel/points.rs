@@ -8,7 +8,7 @@ use super::types::{KernelConstants, at};
 use crate::cell::estimator::state_vector::LOG_RESISTANCE;
 use crate::filter::simd::{Lanes, Mask};
 
-/// Number of columns of the Cholesky factor that change more than branch voltages.
+/// Number of columns of the Cholesky factor that are computed. The other columns change only branch voltages.
 pub(super) const COLUMNS: usize = 3;
 
 /// The first columns of the lower Cholesky factor, and the remaining covariance of the branches.
@@ -91,11 +91,12 @@ fn is_positive<const L: usize, const N: usize>(rest: &[[Lanes<L>; N]; N]) -> Mas
     positive
 }
 
-/// Resistance ratios of the sigma points relative to the centre. The third pair has the ratio of the centre.
+/// Resistances of the sigma points, divided by the resistance at the centre. The third pair has the same resistance as
+/// the centre.
 pub(super) struct ResistanceRatios<const L: usize> {
     pub(super) first: [Lanes<L>; 2],
     /// Odd and even part of the second pair's factor: sinh d / s and (cosh d - 1) / s. d is the distance of the points
-    /// from the centre in ln(resistance).
+    /// from the centre in ln(resistance); s is [`KernelConstants::scale`].
     pub(super) second: [Lanes<L>; 2],
 }
 
@@ -122,14 +123,15 @@ pub(super) struct OddEvenParts<const L: usize> {
 impl<const L: usize> OddEvenParts<L> {
     pub(super) const NONE: Self = Self { odd: [Lanes([0.0; L]); COLUMNS], even: [Lanes([0.0; L]); COLUMNS] };
 
-    /// Sets the parts of pair `k` from the images of its plus point, its minus point and the centre.
+    /// Sets the parts of pair `k` from the values of the function at its plus point, at its minus point and at the
+    /// centre.
     #[inline(always)]
     pub(super) fn put(&mut self, c: &KernelConstants, k: usize, plus: Lanes<L>, minus: Lanes<L>, centre: Lanes<L>) {
         self.odd[k] = (plus - minus) * (0.5 / c.scale);
         self.even[k] = ((plus + minus) * 0.5 - centre) * (1.0 / c.scale);
     }
 
-    /// Offset of the mean from the image of the centre.
+    /// Mean of the function minus its value at the centre.
     #[inline(always)]
     pub(super) fn shift(&self, c: &KernelConstants) -> Lanes<L> {
         (self.even[0] + self.even[1] + self.even[2]) * (1.0 / c.scale)

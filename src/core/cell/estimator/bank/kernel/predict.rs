@@ -3,8 +3,8 @@
 //! In: a state, charge (A s) and time (s). Out: mean and covariance after this time, in the units of the states, and a
 //! mask of the lanes whose covariance was positive definite. Each lane is one cell.
 //!
-//! [`super`] explains the centre, the pairs, and the odd and even parts. A constant error is an error that does not
-//! change with time, such as the offset of a sensor.
+//! [`super`] explains the centre and the pairs of the sigma points, and the odd and even parts of a function. A
+//! constant error is an error that does not change with time, such as the offset of a sensor.
 
 use super::points::{COLUMNS, OddEvenParts, PartialCholesky, ResistanceRatios, sum};
 use super::types::{FilterState, KernelConstants, StepInput, at};
@@ -164,7 +164,8 @@ pub(in crate::cell::estimator::bank) fn predict<const L: usize, const N: usize, 
         p[at(i, CAPACITY)] = sum(capacity_column, odd);
         for j in BRANCHES..=i {
             let (other, other_decay) = &done[j];
-            // All columns after the second are multiplied by the decay factors of the two branches.
+            // All columns of the Cholesky factor after the second are multiplied by the decay factors of the two
+            // branches.
             let others = x.covariance[at(i, j)] - l[0][i] * l[0][j] - l[1][i] * l[1][j];
             p[at(i, j)] = odd[0] * other.odd[0]
                 + odd[1] * other.odd[1]

@@ -1,7 +1,7 @@
-//! State, inputs, outcome and constants of the kernel.
+//! State, inputs, outcome and constants of the kernel, which is the vector code of the filter.
 //!
-//! In: the estimator's settings and the cell model. Out: values in the units of the states, one cell per lane. Constant
-//! errors do not change with time, for example the offset of a sensor.
+//! In: the estimator's settings and the cell model. Out: values in the units of the states, one cell per lane. A
+//! *constant error* is an error that does not change with time, for example the offset of a sensor.
 
 use std::array::from_fn;
 
@@ -134,7 +134,7 @@ pub(in crate::cell::estimator::bank) struct ProcessVariances {
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct ReadingVariances {
     pub(super) sensor: f64,
-    /// If the tables state no error: variance of the model's error over one second.
+    /// Variance of the model's error over one second. Used only if the tables of the cell model state no error.
     pub(super) model: f64,
     /// Variance of the model's error over one second, per square of the voltage drop.
     pub(super) drop: f64,

@@ -1,11 +1,13 @@
 //! Updates the state with a measured voltage.
 //!
 //! In: a state and the reading (V). Out: the updated state, the innovation (V), its variance (V^2), and the test ratio.
-//! The test ratio is the squared innovation divided by the variance that the gate assumes. One mask marks the usable
-//! lanes (cells), and another mask marks the lanes within the gate.
+//! The innovation is measured minus predicted voltage. The gate is a bound on the innovation: a reading beyond it does
+//! not change the state. The test ratio is the squared innovation divided by the variance that the gate assumes. One
+//! mask marks the lanes (cells) whose result is usable, and another mask marks the lanes whose reading is within the
+//! gate.
 //!
-//! [`super`] explains the centre, the pairs, and the odd and even parts. A constant error is an error that does not
-//! change with time, such as the offset of a sensor.
+//! [`super`] explains the centre, the pairs, and the odd and even parts of the sigma points. A constant error is an
+//! error that does not change with time, such as the offset of a sensor.
 
 use super::points::{COLUMNS, OddEvenParts, PartialCholesky, ResistanceRatios};
 use super::types::{
@@ -27,8 +29,8 @@ struct PredictedVoltage<const L: usize> {
     /// For each of the first [`COLUMNS`] pairs of sigma points.
     parts: OddEvenParts<L>,
     slope_v: Lanes<L>,
-    /// Changes of the open-circuit voltage: first per Ah of capacity (V per Ah), then per standard deviation of each
-    /// mix of losses (V, see `crate::cell::aged_ocv`).
+    /// Changes of the open-circuit voltage. The first is per Ah of capacity (V per Ah). Each of the others is per
+    /// standard deviation of one electrode's share in the capacity loss (V, a "mix" in `crate::cell::aged_ocv`).
     changes_v: [Lanes<L>; 1 + MIXES],
     lost_v: Lanes<L>,
     r0_ohm: Lanes<L>,
@@ -86,8 +88,8 @@ impl<const L: usize> PredictedVoltage<L> {
     }
 }
 
-/// Contribution of `part_v`, a part of branch `i`'s voltage, to the cell's voltage. The slowest branch is multiplied by
-/// its learned ratio.
+/// Converts `part_v`, a part of branch `i`'s voltage, to its part of the cell's voltage. For the slowest branch, this
+/// multiplies by the learned resistance ratio of the branch; for the others, it changes nothing.
 #[inline(always)]
 fn weighed<const L: usize, const N: usize, const T: usize>(
     x: &FilterState<L, N, T>,
@@ -97,7 +99,7 @@ fn weighed<const L: usize, const N: usize, const T: usize>(
     if i == N - 1 { part_v * x.memory[SLOW_RATIO] } else { part_v }
 }
 
-/// Effect of one standard deviation of each constant error on the innovation (V).
+/// For each constant error, the shift of the innovation by one standard deviation of the error (V).
 #[inline(always)]
 fn by_constant<const L: usize, const N: usize, const T: usize>(
     c: &KernelConstants,

@@ -1,4 +1,5 @@
-//! The textbook filter of one cell: prediction of all sigma points through the circuit, and update with a voltage.
+//! The unscented Kalman filter of one cell in the form of a textbook, with which the tests compare the fast filter. It
+//! predicts all sigma points through the circuit, and updates them with a voltage.
 
 use nalgebra::SVector;
 
@@ -14,8 +15,9 @@ fn spread<const N: usize>(config: &EstimatorConfig) -> SigmaPointWeights {
     SigmaPointWeights::new(N, config.points.alpha, config.points.beta, config.points.kappa)
 }
 
-/// Predicts over the measured and the unmeasured time of a step. Possible use in the unmeasured time adds the standard
-/// deviation `gap_std` to the SOC (fraction).
+/// Predicts over the time of a step with a measured current, then over the time without one. The cell may have been
+/// used in the time without a measurement: `gap_std` is the standard deviation of the SOC change by this use
+/// (fraction).
 #[inline]
 pub(super) fn predict<const N: usize>(
     x: &mut Gaussian<N>,
@@ -42,9 +44,9 @@ pub(super) fn predict<const N: usize>(
     Ok(())
 }
 
-/// Predicts the state after `dt_s` with the circuit's equations. `charge_as` is the charge moved (A s). `offset_s` is
-/// the time in which this charge contains the current sensor's offset (s). Adds all noise except that of the SOC, which
-/// the caller adds.
+/// Predicts the state after `dt_s` with the circuit's equations. `charge_as` is the charge moved (A s). The current
+/// sensor's offset was part of this charge for `offset_s` seconds. Adds the noise of all states except the SOC. The
+/// caller adds the noise of the SOC.
 fn propagate<const N: usize>(
     x: &mut Gaussian<N>,
     model: &CellModel,
@@ -54,8 +56,8 @@ fn propagate<const N: usize>(
 ) -> Result<(), FilterError> {
     let mean_current_a = if dt_s > 0.0 { charge_as / dt_s } else { 0.0 };
     let temperature = model.temperature_position(temperature_c);
-    // The branch parameters are read at the SOC in the middle of the step, computed with the mean capacity. With the
-    // capacity of each sigma point, this SOC would differ by at most 1e-6.
+    // The branch parameters are read at the SOC in the middle of the step. This SOC is computed with the mean capacity
+    // for all sigma points. The capacity of each sigma point would change it by at most 1e-6.
     let half_soc = 0.5 * charge_as / (3600.0 * x.mean[CAPACITY]);
     let position = |soc: f64| model.grid_position_at(&temperature, soc - half_soc);
     let f = |x: &SVector<f64, N>| {
@@ -72,8 +74,9 @@ fn propagate<const N: usize>(
     let here = position(x.mean[0]);
     let q = noise::process::<N>(model, config, &here, dt_s);
 
-    // The effects of the constant errors (such as a sensor offset) follow from two sources: the derivatives of the
-    // circuit at the mean, and the excess charge that the sensor counts.
+    // `by_constant` is the shift of each state by one standard deviation of each constant error (an error that does not
+    // change with time, such as a sensor offset). The prediction changes this shift in two ways: the circuit passes the
+    // old shift on, and the sensor counts excess charge.
     let mut by_constant = x.by_constant;
     let (per_as, ratio) = (1.0 / (3600.0 * x.mean[CAPACITY]), libm::exp(x.mean[LOG_RESISTANCE]));
     let mut excess_as = [0.0; CONSTANT_ERRORS];
@@ -98,8 +101,8 @@ fn propagate<const N: usize>(
     Ok(())
 }
 
-/// Updates with a voltage reading. Also returns the effect of one standard deviation of each constant error on the
-/// innovation (V).
+/// Updates with a voltage reading. Also returns, for each constant error, by how much one standard deviation of the
+/// error shifts the innovation (V).
 #[inline]
 pub(super) fn update<const N: usize>(
     x: &mut Gaussian<N>,

@@ -1,4 +1,5 @@
-//! Computes the process noise of a step and the measurement noise of a voltage reading for the textbook filter.
+//! Computes the process noise of a step and the measurement noise of a voltage reading for the textbook filter (the
+//! plain reference filter of the estimator's tests).
 
 use nalgebra::{SMatrix, SVector};
 
@@ -41,9 +42,9 @@ pub(super) struct VoltageReading {
     pub(super) load_a: f64,
     pub(super) temperature: TemperaturePosition,
     pub(super) information_s: f64,
-    /// Capacity (Ah) that selects the open-circuit curve of the aged cell, as learned up to the end of the last charge
-    /// or discharge. If a voltage changed this capacity at once, errors of the model would be mistaken for lost
-    /// capacity.
+    /// The capacity (Ah) that was learned up to the end of the last charge or discharge. It selects the open-circuit
+    /// curve of the aged cell. Voltage readings do not change it at once, because errors of the model would then be
+    /// mistaken for lost capacity.
     pub(super) curve: ScalarGaussian,
     /// Resistance ratio of the slowest branch, in addition to the resistance ratio of the cell.
     pub(super) slow_ratio: f64,

@@ -1,11 +1,12 @@
 //! Unscented Kalman filter with additive noise and a scalar measurement.
 //!
-//! Sigma points, weights and the columns of the constant errors are described in [`crate::cell::estimator`]. A
-//! prediction passes every point through f and takes the mean and covariance of the images, plus Q. An update
-//! **redraws** the points from the predicted mean and covariance and passes them through h. Some packages reuse the
-//! propagated points instead, which changes the SOC by up to 3e-4 on drive data.
+//! Sigma points, weights and the columns of the constant errors (such as a sensor's offset) are described in
+//! [`crate::cell::estimator`]. A prediction passes every point through f and takes the mean and covariance of the
+//! images, plus Q. An update **redraws** the points from the predicted mean and covariance and passes them through h.
+//! Some packages reuse the propagated points instead, which changes the SOC by up to 3e-4 on drive data.
 //!
-//! Constant errors are not estimated here. The total covariance is P plus the outer products of their columns.
+//! The filter does not estimate the constant errors. Each of them has a column with its effect on the mean. The total
+//! covariance is P plus the outer products of these columns.
 //!
 //! A failed factorisation or a non-finite number is an error. Sums are plain loops in a fixed order, so every machine
 //! gives the same bits.
@@ -58,8 +59,8 @@ pub(super) struct MeasurementNoise {
     /// represents.
     pub(super) gate_variance: f64,
     pub(super) gate_sigma: f64,
-    /// Change of the innovation per standard deviation of each constant error. It contains the direct effect, and the
-    /// effect through the errors of the mean that the constant error has caused.
+    /// Change of the innovation per standard deviation of each constant error. A constant error changes the innovation
+    /// directly, and also through the error of the mean that it has caused so far.
     pub(super) by_constant: SVector<f64, CONSTANT_ERRORS>,
 }
 
@@ -127,7 +128,7 @@ impl<const N: usize> Gaussian<N> {
         for y in plus.iter().chain(&minus) {
             predicted += y * spread.others;
         }
-        // The centre equals the mean, so it adds to the variance, but not to `cross`.
+        // The centre point equals the mean, so its term in `cross` is 0. Its term in the variance is not 0.
         let mut spread_variance = spread.covariance_0 * (centre - predicted) * (centre - predicted);
         let mut cross = SVector::<f64, N>::zeros();
         for (x, y) in points.plus.iter().chain(&points.minus).zip(plus.iter().chain(&minus)) {

@@ -1,18 +1,20 @@
-//! Finds the limit of a current sensor. A noisy sensor repeats its readings exactly only at its limit.
+//! Detects readings at which a current sensor is at its limit (the largest current that it can report). A noisy sensor
+//! repeats a reading exactly only at its limit.
 //!
 //! In: readings of the current (A), and whether the load is steady. Out: evidence against the sensor.
 //!
 //! If the last digits of a sensor usually change under a steady load, a run of equal readings shows that the sensor is
 //! at its limit. Two kinds of sensors repeat their readings for other reasons, so their repeats are not evidence. A
 //! coarse sensor repeats its readings, or changes them by one step. A sensor without noise repeats its readings while a
-//! charger or a cycler holds the current. Such a sensor is recognised by repeated readings of two sizes.
+//! charger or a cycler holds the current. A sensor without noise is recognised when it has repeated two different
+//! currents.
 
 use serde::{Deserialize, Serialize};
 
 use super::{DOUBTFUL, MAX_EVIDENCE};
 use crate::quantity::{InvalidState, bounds};
 
-/// Weight of a reading in the share of readings that differ by noise.
+/// Weight of a new reading in the running average [`SensorLimit::noisy`].
 const NOISE_GAIN: f64 = 0.02;
 /// Lowest probability that a good sensor repeats a reading exactly.
 const MIN_REPEAT: f64 = 0.01;
@@ -40,10 +42,10 @@ pub(super) struct SensorLimit {
     repeated: f64,
     /// Number of times that the present reading has repeated.
     equal: u32,
-    /// Size of a current (A) that the sensor has read [`QUIET_READINGS`] times in a row before it has shown noise; 0 =
-    /// no such current.
+    /// Size of a current (A) that the sensor has repeated [`QUIET_READINGS`] times in a row while most of its readings
+    /// showed no noise; 0 = no such current.
     quiet_a: f64,
-    /// Whether the sensor has repeated two currents of different size.
+    /// Whether the sensor has repeated two currents of different size, so that its repeats are not evidence.
     is_quiet: bool,
     /// Largest reading of discharge and of charge (A).
     largest_a: [f64; 2],
@@ -84,13 +86,14 @@ impl SensorLimit {
             return 0.0;
         }
         let mut evidence = if self.limits_a.contains(&now_a) { DOUBTFUL } else { 0.0 };
-        // A limit is the largest reading in its direction.
+        // Only the largest reading in its direction can be a limit.
         let is_largest = now_a.abs() >= self.largest_a[direction];
         if change_a > 0.0 || !is_largest || self.is_quiet {
             self.repeated = 0.0;
         } else {
             self.repeated += libm::log((1.0 - self.noisy).max(MIN_REPEAT) / FAULTY_REPEAT).min(0.0);
-            // The present run may still show that the sensor has no noise.
+            // The sensor has already repeated one current many times. If it repeats the present reading as often, it
+            // has no noise.
             let is_open = self.quiet_a > 0.0 && self.equal < QUIET_READINGS;
             if self.repeated <= REPEATED && !is_open {
                 self.repeated = 0.0;

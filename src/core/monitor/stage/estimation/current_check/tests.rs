@@ -44,7 +44,8 @@ fn round(check: &mut CurrentCheck, time_s: u32, current_a: Option<f64>, voltage_
     handle(check, &samples(time_s, current_a, voltage_v));
 }
 
-/// The samples of a round of the drive. `measured` returns the reading for the load and the time.
+/// The samples of one round of the drive (one sample of every cell). `measured` returns the reading for the load and
+/// the time.
 fn drive_samples(time_s: u32, measured: impl Fn(f64, u32) -> Option<f64>) -> Vec<CellSample> {
     let current_a = measured(load_a(time_s), time_s).map(|current_a| current_a + noise_a(time_s));
     samples(time_s, current_a, |cell| 3.7 - 1.2 * OHM * load_a(time_s) + 1e-4 * ((time_s as usize + cell) % 5) as f64)

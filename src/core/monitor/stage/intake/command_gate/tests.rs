@@ -8,7 +8,8 @@ const SECOND_NS: i64 = 1_000_000_000;
 const RESET: [u8; 4] = [1, 0, 0, 0];
 const CLEAR: [u8; 4] = [2, 0, 0, 0];
 
-/// A gate, and a sender that uses each announced freshness in rising order.
+/// A gate, and a sender of commands. The gate announces freshness values (counters that are valid once), and the sender
+/// uses them in rising order.
 struct Bench {
     gate: CommandGate,
     now: Timestamp,

@@ -128,7 +128,7 @@ fn announced_unknown_alarms_are_limited() {
     let (mut queue, mut engine) = (AlarmQueue::default(), engine());
     let mut announced = 0;
     for second in 0..i64::from(CELLS) {
-        // In each round, another cell is the first unknown cell.
+        // In each round, the value of one more cell becomes known, so the first unknown cell is a different one.
         observe(&mut engine, Rule::EstimateUntrusted, Some(u16::try_from(second).unwrap()), Some(1.0));
         announced += u32::from(queue.take_unknown(Timestamp::from_secs(second as f64), &engine, 0).is_some());
     }
@@ -180,7 +180,7 @@ fn restart_after_burst_sends_no_second_burst() {
     for cell in 0..CELLS {
         queue.note_change(Timestamp::from_secs(10.0), cell_key(cell));
     }
-    // The state was stored before the first frame.
+    // The state was stored before the first of these frames was sent.
     let mut stored = queue.clone();
     let mut frames = sent(&mut queue, &engine, 10_000, 100).len();
     assert!(frames > usize::try_from(BURST).unwrap());

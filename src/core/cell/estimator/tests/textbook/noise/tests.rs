@@ -45,7 +45,8 @@ fn reading_variance_sums_its_parts() {
     assert!(near(at(5.0, 2.0, 10.0).variance, (base + drop + load) / 10.0));
     assert!(near(at(0.0, 2.0, 1.0).variance, base + drop));
     assert_eq!(at(5.0, 2.0, 10.0).gate_variance, at(0.0, 0.0, 1.0).gate_variance);
-    // The model states its error as an average over 100 s: 20 mV over 100 s correspond to 0.2 V over one second.
+    // The model states its error as an average over 100 s. Noise averages out with the square root of the time, so 20
+    // mV over 100 s correspond to 0.2 V over one second.
     model.voltage_error_v = Some(Table { values: vec![vec![0.01, 0.02, 0.03]; 2] });
     let variance = of(&model, 0.0, 2.0, 1.0).variance;
     assert!(near(variance, 0.2 * 0.2 + drop), "{variance} {}", 0.2 * 0.2 + drop);
