@@ -12,7 +12,8 @@ impl ChannelList {
         self.index_of(&Channel::Number { written, index: written.saturating_sub(first) })
     }
 
-    /// Index of a channel in a log whose channel numbers do not show an order; `None` if the list is full.
+    /// Index of a channel in a log that numbers its channels arbitrarily (for example with the kernel's interface
+    /// numbers). The channels are indexed in the order of their first frame. `None` if the list is full.
     pub(crate) fn of_label(&mut self, written: u32) -> Option<u8> {
         let is_same = |known: &Channel| matches!(known, Channel::Number { written: number, .. } if *number == written);
         let index = self.0.iter().position(is_same).unwrap_or(self.0.len());

@@ -7,7 +7,8 @@
 //!
 //! [`Mf4Writer`] writes frames as MF4, for other tools.
 //!
-//! candump logs (`candump -L`), journals and CSV tables are read by `packwatch_host::io::log`.
+//! `packwatch_host::io::log` reads candump logs (`candump -L`), CSV tables, and packwatch's own journals (recordings of
+//! the daemon's inputs).
 
 mod blf;
 mod byte_stream;

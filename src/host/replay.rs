@@ -54,7 +54,8 @@ pub struct ReplaySettings {
     pub from: Option<LogTime>,
     /// Records after this time are skipped.
     pub until: Option<LogTime>,
-    /// Sleep gap (s). In a longer gap of the log, the recorder counts as asleep.
+    /// Sleep gap (s). If the next record arrives later than this after a record, the computer that recorded the log
+    /// counts as asleep: the ticks stop after this time, and a paced replay does not wait through the gap.
     pub sleep_gap_s: f64,
     /// Whether to take a snapshot.
     pub snapshot: bool,
@@ -445,7 +446,8 @@ impl Replay {
         }
         let readings = self.monitor.reading_counts().since(&before.readings);
         let failure = failure::failure(&summary, &span, steps, &readings, &self.settings.interfaces);
-        // A journal was recorded with this configuration, so missing estimates do not mean that the file is wrong.
+        // For a plain log, the reason is a failure, because the log may have a wrong format or be of another vehicle. A
+        // journal was recorded by packwatch with its configuration, so the reason is only a note.
         match failure {
             Some(reason) if self.is_journal => summary.notes.push(reason),
             failure => summary.failure = failure,

@@ -1,4 +1,5 @@
-//! Implements the Python class `CellModel`: open-circuit voltage and resistances of a cell, from a file or a label.
+//! Implements the Python class `CellModel`: open-circuit voltage and resistances of a cell, from a file or from a label
+//! (chemistry, rated capacity and voltage limits).
 
 use std::path::{Path, PathBuf};
 

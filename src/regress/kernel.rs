@@ -13,8 +13,9 @@
 //! | `rational_quadratic` | (1 + r^2 / (2 alpha))^-alpha |
 //!
 //! Operators have their usual precedence, as in `a + b * (c + d)`. A name may contain dashes instead of underscores.
-//! Every shape has its own length scales and its own standard deviation. In a product, only the first factor has a
-//! standard deviation, because several standard deviations could not be distinguished.
+//! Every shape has its own length scales. A shape also has its own standard deviation, unless it is the second or a
+//! later factor of a product, because the standard deviations of several factors could not be distinguished. If such a
+//! factor is a sum, only the first term of the sum has no standard deviation.
 
 use std::fmt;
 use std::str::FromStr;

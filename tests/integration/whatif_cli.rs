@@ -81,8 +81,9 @@ fn lead_times_follow_truth_file() {
         let later = row(&document, log, 2)["first"]["days"].as_f64();
         assert!(later.is_none_or(|later| later >= raised), "{later:?} before {raised}");
     }
-    // If the cell never reaches its end of life (here 1.0 Ah), the raises are false. If the horizon is also longer than
-    // the log, they are undecided.
+    // If the cell never reaches its end of life (here 1.0 Ah), every raised alarm counts as a false alarm. With a
+    // horizon, the end of life must follow a raised alarm within this time. If the log ends earlier, the alarm cannot be
+    // judged and counts as open.
     let healthy = [&set[..3], &["1.0", "a.log.gz"]].concat();
     let document = bench.whatif(&healthy);
     assert_eq!(row(&document, 0, 1)["false_alarms"], row(&document, 0, 1)["raises"]);

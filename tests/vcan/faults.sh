@@ -1,7 +1,7 @@
-# shellcheck shell=bash Helpers for tests of faults: . "$(dirname "$0")/lib.sh"; . "$(dirname "$0")/daemon.sh"; .
-# "$(dirname "$0")/faults.sh" A daemon with its state on disk learns from fast_pack (a simulated pack in fast motion)
-# while faults occur. Each test prints one line per fault. At the end, it compares the store with the events that the
-# daemon has reported.
+# shellcheck shell=bash
+# Helpers for tests of faults:   . "$(dirname "$0")/lib.sh"; . "$(dirname "$0")/daemon.sh"; . "$(dirname "$0")/faults.sh"
+# A daemon with its state on disk learns from fast_pack (a simulated pack in fast motion) while faults occur. Each test
+# prints one line per fault. At the end, it compares the store with the events that the daemon has reported.
 
 # State folder of the daemon `main`. A test with its own disk overrides this path.
 state=$tmp/state

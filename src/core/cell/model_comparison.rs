@@ -95,7 +95,8 @@ fn ocv_v(model: &CellModel, soc: f64) -> f64 {
     model.ocv_v(&model.grid_position(soc, CURVE_C))
 }
 
-/// Whether a temperature is within the tables of a model. A single temperature counts as [`CURVE_C`].
+/// Whether a temperature is within the tables of a model. If the tables have only one temperature, returns true only
+/// for [`CURVE_C`].
 fn has(model: &CellModel, temperature_c: f64) -> bool {
     match model.temperature_c[..] {
         [_] => temperature_c == CURVE_C,

@@ -1,9 +1,9 @@
 //! Detects faults of the cells of a pack and of their sensors. The detector adds samples to rows (sums over a few
 //! minutes), compares the cells once per row and derives findings from the comparison (`judge`).
 //!
-//! The errors that are assumed for a row are round numbers that are typical of a circuit model and of a cell monitor.
-//! They were checked on simulated packs. Only the slope of the open-circuit curve (`pack_slope`) and the limit of a
-//! charge difference were also tuned on measurements of two cars.
+//! The assumed errors of a row (the standard deviations in `shared_row`) are rounded values. They are typical of an
+//! equivalent-circuit model and of a cell monitor chip, and were checked on simulated packs. Only the slope of the
+//! open-circuit curve (`pack_slope`) and the limit of a charge difference were also tuned on measurements of two cars.
 
 mod balancing;
 mod judge;

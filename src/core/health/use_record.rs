@@ -4,9 +4,9 @@
 //! In: a [`UseSample`] every 0.1 s, and the half-cycles. Out: a [`UseRecord`] of fixed size, whose counts only increase
 //! until the pack is replaced. Currents are per cell. Units: A (positive = discharge), degrees C, s.
 //!
-//! * Time counts only while the program receives ticks. A longer step ([`LONGEST_S`]) is a gap. A gap can count only as
-//!   rest at a high SOC. For this, its length must be known, the pack must have rested before it, and the SOC must be
-//!   the same after it.
+//! * Time counts only while the program receives ticks. A step of time longer than [`LONGEST_S`] is a gap. A gap can
+//!   count only as rest at a high SOC. For this, its length must be known, the pack must have rested before it, and the
+//!   SOC must be the same after it.
 //! * If a value is unknown or doubtful, the time counts as unknown, neither as inside nor as beyond the limits. If only
 //!   some sensors are known, a known value beyond its limit still counts as beyond.
 //! * If a limit is not configured, no time counts as known for this limit.
@@ -19,7 +19,8 @@ use crate::sample::SensorRange;
 
 /// Longest time between two ticks that counts as observed (s). A running program sends ticks more often.
 const LONGEST_S: f64 = 5.0;
-/// An event is at least this time beyond a limit (s), plus the longest time for which a single reading is valid.
+/// To count as an event, a value must be beyond a limit for this time (s) plus the longest time for which a single
+/// reading is valid. A single wrong reading is therefore not an event.
 const EVENT_S: f64 = 1.0;
 /// An event ends after this time within the limit (s), so that a value at the limit is one event, not many.
 const WITHIN_S: f64 = 10.0;
@@ -43,8 +44,8 @@ pub struct LimitUse {
     pub beyond_s: f64,
     /// Part of the time beyond the limit in which the pack was charged (s).
     pub beyond_charging_s: f64,
-    /// Number of events. An event is at least 1 s beyond the limit, plus the longest time for which a single reading is
-    /// valid. It ends after 10 s within the limit.
+    /// Number of events. An event begins when the value has been beyond the limit for 1 s plus the longest time for
+    /// which a single reading is valid. It ends after 10 s within the limit.
     pub events: u64,
 }
 

@@ -110,7 +110,7 @@ impl GroupReader {
         lowest
     }
 
-    /// Index of the next record's group, and length of the record with its number; `None` at the end.
+    /// Index of the next record's group, and length of the record including its ID; `None` at the end.
     #[inline]
     fn next_record(&self, stream: &mut ByteStream<DataBlocks>) -> io::Result<Option<(usize, usize)>> {
         record_of(&self.records, self.id_len, stream)
@@ -223,8 +223,8 @@ impl GroupReader {
     }
 }
 
-/// Index of the next record's group, and length of the record including its number. For a value of variable length,
-/// this is the length of its number and its length field. `None` at the end.
+/// Index of the next record's group, and length of the record including its ID. For a value of variable length, the
+/// length covers only the ID and the length field, not the value. `None` at the end.
 #[inline]
 fn record_of(
     records: &[RecordGroup],

@@ -6,8 +6,8 @@
 //! with more than four digits is extended.
 //!
 //! A date in a file is local time without a zone; it is read as UTC. The start time in days is read as a 64-bit float,
-//! which resolves about a microsecond. If a whole millisecond rounds to the written digits, this millisecond is the
-//! start.
+//! which resolves about a microsecond. If the written digits can be a rounded whole millisecond, this millisecond is
+//! the start. Otherwise, the start is rounded to a microsecond.
 
 use std::io;
 
@@ -21,7 +21,8 @@ use crate::Item;
 /// 1 January 1970 in days since 30 December 1899.
 const UNIX_DAYS: i128 = 25_569;
 const DAY_NS: i128 = 86_400_000_000_000;
-/// For dates from 1911, a 64-bit float of days stores the fraction of the day in at most this number of bits.
+/// Number of bits used for the fraction of the day in a start time. A 64-bit float has 53 significant bits. For dates
+/// from 1911, the whole days (4096 or more) take at least 13 of them, so the fraction has at most 40 bits.
 const FRACTION_BITS: i32 = 40;
 /// Largest number of columns. The newest version has 15.
 const MAX_COLUMNS: usize = 32;

@@ -15,8 +15,9 @@ use crate::sample::VoltageSource;
 /// Minimum of the default sleep gap (s).
 const LEAST_SLEEP_GAP_S: f64 = 30.0;
 
-/// Default sleep gap (s). During a longer gap of a log, the recorder counts as asleep. The sleep gap is at least the
-/// maximum age of a current and of a voltage, so the recorder is not asleep while one of them is fresh.
+/// Default sleep gap (s). If a log contains no record for longer than this, the computer that recorded the log counts
+/// as asleep. The sleep gap is at least the maximum age of a current and of a voltage, so the computer counts as awake
+/// while one of these values is fresh.
 pub fn sleep_gap_s(config: &MonitorConfig) -> f64 {
     LEAST_SLEEP_GAP_S.max(config.sample.current.max_age_s).max(config.sample.voltage.max_age_s)
 }

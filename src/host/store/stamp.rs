@@ -1,4 +1,4 @@
-//! Stores with a state the time that each clock shows, and computes the age of the state at a later time.
+//! The stamp of a stored state contains the time of every clock. The age of the state is later computed from its stamp.
 //!
 //! The wall clock of a vehicle computer may show 1970 until it is set, and it may step. The boot clock never steps,
 //! but starts again with every boot. Therefore the times of both clocks are stored, together with the identity of the
@@ -112,8 +112,8 @@ impl WallClock {
 
     fn judge(now: &Stamp, hardware_clocks: &Path, synchronised: &Path) -> Self {
         let wall_s = now.wall_ns / 1_000_000_000;
-        // A hardware clock without a battery counts from the time at which it got power. A hardware clock therefore
-        // counts only if its time agrees with the wall clock.
+        // A hardware clock without a battery restarts from a fixed date when it gets power. A hardware clock therefore
+        // confirms the wall clock only if their times agree.
         let agrees = |clock: &Path| {
             let text = std::fs::read_to_string(clock.join("since_epoch")).ok();
             let hardware_s = text.and_then(|text| text.trim().parse::<i64>().ok());

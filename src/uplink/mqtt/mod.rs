@@ -53,9 +53,9 @@ pub mod topic {
     pub const UPLINK: &str = "uplink";
 }
 
-/// Payload of an available state, as Home Assistant expects it.
+/// Payload that reports the uplink or the daemon as online. Home Assistant expects this word by default.
 pub const ONLINE: &str = "online";
-/// Payload of an unavailable state.
+/// Payload that reports the uplink or the daemon as offline.
 pub const OFFLINE: &str = "offline";
 
 /// Runs until a signal of [`Stop`].

@@ -7,8 +7,8 @@ use crate::can::dbc::Database;
 use crate::can::signal::{ByteOrder, SignalLayout, ValueType};
 use crate::quantity::CellIndex;
 
-/// A plain message with the voltage first and the current last, a multiplexed message with one signal on every page,
-/// and a message with nested pages.
+/// A plain message with the voltage first and the current last, a multiplexed message whose signal `Air` is present on
+/// every page (for every value of the multiplexer), and a message with nested pages.
 pub(crate) const DBC: &str = r#"VERSION ""
 BU_: BMS
 BO_ 256 Pack: 6 BMS

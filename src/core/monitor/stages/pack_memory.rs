@@ -1,8 +1,8 @@
 //! Stores the learned values of disconnected packs by pack number, and returns them when a pack is connected again.
 //!
 //! If a reading shows another pack number, the learned values of the connected pack are put aside. When further
-//! readings confirm the new number, the values that were put aside are stored. If values of the new pack are stored,
-//! they are returned.
+//! readings confirm the new number, the values that were put aside are stored. If the memory already contains values of
+//! the new pack, it returns them.
 //!
 //! The stored values are the cell model, capacities, resistances, remaining lives, recharge periods, findings and the
 //! offset of the current sensor (a pack often has its own sensor). The unfinished half-cycle (charge or discharge) and
@@ -150,8 +150,9 @@ impl StoredCell {
         bounds::TIME_S.check("the unmeasured time used by a cell's filter", unmeasured_s)
     }
 
-    /// Whether the stored filter has as many RC branches as the bank's model of this cell. A cell of a module (cells of
-    /// another type in the pack) always fits: another number of branches only means that the module was replaced.
+    /// Whether the stored filter has as many RC branches as the bank's model of this cell. A cell in a module (a group
+    /// of cells of another type in the pack) always fits, even if the number of branches differs, because a module can
+    /// be replaced without replacing the pack.
     pub(crate) fn fits(&self, bank: &PackBank, index: usize) -> bool {
         !bank.is_own(index) || CellEstimator::restore(&self.estimator, bank.model(index).branches.len()).is_some()
     }

@@ -11,7 +11,7 @@
 //! | `values` | units, byte order, limits |
 //! | `frozen` | signals that never change, cells that respond differently, cells with the same voltage |
 //! | `reported` | the pack's own state of charge against the counted charge and the voltages (`ocv`) |
-//! | `electrical` | sign of the current, resistance (from steps or from the `drift` of steady runs) |
+//! | `electrical` | sign and unit of the current, resistance; without current steps, the sign from the voltage `drift` |
 //! | `model` | open-circuit voltage, current offset, noise, the estimator |
 //! | `timing` | periods |
 //! | `holes` | missing stretches |
@@ -72,7 +72,8 @@ impl WiringObserver {
     }
 }
 
-/// Folds the consequences of a wrong layout into the finding on the layout.
+/// Folds the consequences of a wrong signal layout (byte order, sign or position of the bits) into the finding on this
+/// layout.
 fn fold(judge: &mut Judge<'_>) {
     const OF_VALUES: [Topic; 8] = [
         Topic::CellCount,

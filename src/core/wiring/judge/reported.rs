@@ -15,8 +15,8 @@ use crate::wiring::report::{Severity, Topic};
 
 /// Minimum change of a reported state of charge that is compared with the counted charge.
 const LEAST_RANGE: f64 = 0.05;
-/// If more than this share of the moments disagree, a reported value contradicts the voltage. If at least this share of
-/// the moments agree, the value agrees with the voltage.
+/// The voltage is compared with a reported state of charge at many times. The two contradict each other if they
+/// disagree at more than this share of the times. They fit each other if they agree at no less than this share.
 const MOST: f64 = 0.75;
 
 /// Usual ratios of the counted to the configured capacity.
@@ -47,8 +47,8 @@ pub(super) fn check_charge(judge: &mut Judge<'_>) {
         _ => None,
     };
     if let Some((side, is_rise)) = side.filter(|_| !electrical::is_inverted(judge)) {
-        // The sign is missing only if the pack was both charged and discharged. Otherwise, an inverted sign is also
-        // possible.
+        // If the pack was both charged and discharged, a current with only one sign has lost its sign. If the pack was
+        // only charged or only discharged, the sign may be inverted instead, so no missing sign is reported.
         let has_both = |slope: ChargeSlope| slope.rise.min(slope.fall) >= LEAST_RANGE;
         let is_by_soc = found.is_some_and(|(_, slope)| slope.r2 < EXPLAINED && has_both(slope));
         if is_by_soc || ocv::moves_against(judge, true) && ocv::moves_against(judge, false) {
@@ -89,7 +89,8 @@ fn too_much(judge: &mut Judge<'_>, current: &SignalPlan) {
     };
     let largest_ah = moments.chunk_by(|a, b| a.stretch == b.stretch).map(counted).fold(0.0, f64::max);
     let pack_ah = judge.pack_ah();
-    // A full discharge counts the capacity once. In a long log, the offset of the current sensor adds to this.
+    // The charge counted over a full discharge equals the capacity. In a long log, the offset of the current sensor
+    // adds to it, so up to twice the capacity is accepted.
     if largest_ah <= 2.0 * pack_ah {
         return;
     }

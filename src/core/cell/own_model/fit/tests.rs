@@ -1,4 +1,5 @@
-//! Tests the mean and variance of the capacity that follow from the costs on the capacity grid.
+//! Tests `moments`: the mean and variance of the capacity. The probability density at a point of the capacity grid is
+//! proportional to exp(-cost).
 
 use super::*;
 

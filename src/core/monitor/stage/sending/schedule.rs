@@ -9,8 +9,8 @@ use crate::quantity::Timestamp;
 
 /// Number of freshness values (counters of authenticated frames) skipped at a start, because an earlier process may
 /// have sent frames after its state was stored. The driver stores the state before the first frame, and again when half
-/// of these values have been used. With up to 300 starts a day, the freshness stays below the clock's value
-/// ([`FRESHNESS_PER_S`]).
+/// of these values have been used. At [`FRESHNESS_PER_S`] values per second, the clock gains more values in a day than
+/// 300 starts skip, so up to 300 starts a day do not raise the freshness above the clock's value.
 pub const RESTART_FRESHNESS: u64 = 1 << 16;
 /// At a start, the freshness is at least this value times the clock's time in seconds. The daemon sends fewer frames
 /// than this per second, so the clock gives a higher value than earlier runs have used (see [`RESTART_FRESHNESS`]).
@@ -22,10 +22,12 @@ pub(crate) struct Schedule {
     pub(super) status: Timestamp,
     pub(super) health: Timestamp,
     pub(super) alarm: Timestamp,
-    /// Counts the alarm periods; selects the alarm with an unknown value that is announced next.
+    /// Counts the alarm periods. If several thresholds have alarms with unknown values, the count selects the threshold
+    /// whose alarm is announced next.
     pub(super) alarm_turn: usize,
     pub(super) digest: Timestamp,
-    /// Counts the digests; selects the threshold in the next digest.
+    /// Counts the digests (a digest contains the state of every rule, and one threshold). The count selects the
+    /// threshold in the next digest.
     pub(super) threshold_turn: usize,
     /// Earliest time of the next reply.
     pub(super) reply: Timestamp,

@@ -16,9 +16,9 @@ use crate::health::{
 };
 use crate::quantity::bounds;
 
-/// Uncertainty of the open-circuit curve before the first half-cycle is measured. Until then, the cell is assumed to
-/// have a new cell's curve. The value is the standard deviation of the capacity lost so far, as a fraction of a new
-/// cell's capacity.
+/// Standard deviation of the capacity that a cell has lost before its first half-cycle is measured, as a fraction of a
+/// new cell's capacity. Until then, the cell is assumed to have a new cell's open-circuit curve. The curve changes with
+/// the lost capacity, so this value determines the uncertainty of the curve.
 const FIRST_LOSS_STD: f64 = 0.03;
 
 section! {
@@ -48,7 +48,7 @@ section! {
         charge_noise_per_sqrt_soc: f64, "fraction/sqrt(SOC)", DEVIATION, Default("3e-3");
         /// Process noise of the branch voltages.
         branch_noise_v_per_sqrt_s: f64, "V/sqrt(s)", DEVIATION, Default("1e-3");
-        /// Process noise of ln(resistance). It covers ageing, and errors of the cell model's resistance tables: in the cold, and during a few minutes of driving.
+        /// Process noise of ln(resistance). It covers ageing, errors of the cell model's resistance tables in the cold, and changes of the resistance within a few minutes of driving.
         log_resistance_noise_per_sqrt_s: f64, "1/sqrt(s)", DEVIATION, Default("1e-3");
         /// Process noise of the SOC while no current is measured (vehicle asleep).
         gap_noise_per_sqrt_s: f64, "fraction/sqrt(s)", DEVIATION, Default("1.5e-5");
@@ -182,7 +182,7 @@ section! {
             => hysteresis_a: keys.hysteresis_a.unwrap_or(0.5 * keys.dead_band_a(pack_ah));
         /// A new mode must last this long before it is accepted.
         min_duration_s: f64, "s", Between(0.0, 1e6), Default("10.0");
-        /// A charge or discharge smaller than this fraction of the rated capacity is merged with the following ones until their sum reaches it. For method "nominal", set it to most of `nominal_swing`, so that a pause does not split a half-cycle.
+        /// A charge or discharge smaller than this fraction of the rated capacity is merged with the following ones until their sum reaches it. For method "nominal", choose a value somewhat below `nominal_swing`; otherwise a pause can split a half-cycle.
         min_swing: f64, "fraction", Between(0.0, 1.0), Default("0.02");
     }
 }
@@ -202,7 +202,7 @@ section! {
         nominal_swing: f64, "fraction", Above(0.0, 1.0), Default("0.6") =>;
         /// Measurement variance of method "nominal".
         nominal_variance_ah2: f64, "Ah^2", Above(0.0, 1e9), Default("0.1") =>;
-        /// Standard deviation gained per equivalent full cycle ("swing") or per event ("nominal").
+        /// Standard deviation gained per equivalent full cycle ("swing") or per half-cycle ("nominal").
         noise_ah_per_cycle: Option<f64>, "Ah", DEVIATION, Optional("0.5 % of the rated capacity (\"swing\"), 1 Ah (\"nominal\", as in the paper)")
             => noise_ah_per_cycle: keys.noise_ah_per_cycle.unwrap_or(keys.usual_noise_ah(rated_ah));
         /// Standard deviation gained per day of rest, because some capacity recovers at rest ("swing" only).
@@ -298,9 +298,9 @@ section! {
 section! {
     /// Limits for the remaining energy, the times to empty and to full, the power, and the record of use.
     Outlook at "outlook" gives OutlookConfig, |keys, usable: Option<UsableConfig>, rated_ah: f64| {
-        /// Lowest voltage of a cell under load. From half of the cell model's lowest voltage to below its highest.
+        /// Lowest voltage of a cell under load. The value must be at least half of the cell model's lowest voltage and below its highest voltage.
         min_voltage_v: Option<f64>, "V", Above(0.0, 100.0), Optional("the cell model's lowest voltage");
-        /// Highest voltage of a cell under charge. At most 0.5 V above the cell model's highest.
+        /// Highest voltage of a cell under charge. The value must be at most 0.5 V above the cell model's highest voltage.
         max_voltage_v: Option<f64>, "V", Above(0.0, 100.0), Optional("the cell model's highest voltage");
         /// Largest discharge current, per cell.
         max_discharge_a: Option<f64>, "A", Above(0.0, 1e6), Optional("only the voltages limit the current");
@@ -313,7 +313,7 @@ section! {
         /// A charge is complete when its current, per cell, has dropped to this value at the highest voltage.
         taper_current_a: Option<f64>, "A", Above(0.0, 1e6), Optional("`taper_current_a` of `[usable]`, else C/20: the rated capacity over 20 h")
             => taper_current_a: keys.taper_current_a.or(usable.map(|usable| usable.taper_current_a)).unwrap_or(rated_ah / 20.0);
-        /// State of charge for which the time of a charge is stated.
+        /// State of charge up to which the charging time is reported.
         target_soc: f64, "fraction", Between(0.0, 1.0), Default("0.8");
     }
 }

@@ -1,4 +1,4 @@
-//! Predicts the state over a measured time with the circuit's equations.
+//! Predicts the state with the circuit's equations over the *measured time*, in which the current was measured.
 //!
 //! In: a state, charge (A s) and time (s). Out: mean and covariance after this time, in the units of the states, and a
 //! mask of the lanes whose covariance was positive definite. Each lane is one cell.
@@ -164,8 +164,8 @@ pub(in crate::cell::estimator::bank) fn predict<const L: usize, const N: usize, 
         p[at(i, CAPACITY)] = sum(capacity_column, odd);
         for j in BRANCHES..=i {
             let (other, other_decay) = &done[j];
-            // All columns of the Cholesky factor after the second are multiplied by the decay factors of the two
-            // branches.
+            // After the second column, the columns of the Cholesky factor change a branch voltage only by its decay.
+            // The sum of their products is therefore multiplied by the decays of both branches, `i` and `j`.
             let others = x.covariance[at(i, j)] - l[0][i] * l[0][j] - l[1][i] * l[1][j];
             p[at(i, j)] = odd[0] * other.odd[0]
                 + odd[1] * other.odd[1]
