@@ -15,6 +15,7 @@ mod picture;
 mod prepare;
 mod range;
 mod request;
+mod slow_test;
 mod toml;
 mod verdict;
 
