@@ -176,7 +176,7 @@ mod tests {
     #[test]
     fn fit_judges_discharge_and_slow_charge_only() {
         let judged = |test: SlowTest| test.into_source(0, 2.0).judged.iter().filter(|&&is_judged| is_judged).count();
-        assert_eq!(judged(test_with_charge(0.1)), 24 + 20);
-        assert_eq!(judged(test_with_charge(1.0)), 24);
+        assert_eq!(judged(test_with_charge(0.1)), 22 + 20);
+        assert_eq!(judged(test_with_charge(1.0)), 22);
     }
 }
