@@ -13,7 +13,6 @@
 //! * `Swing`: the information about the capacity in all voltages since the last half-cycle. It is computed from the
 //!   sample filter's previous and present estimates of the capacity (`ScalarGaussian::information_until`). The charge
 //!   is not divided by the swing of the sample filter's SOC, because this SOC already depends on the assumed capacity.
-//!   The quotient only checks the measurement: if the two contradict each other, the measurement becomes uncertain.
 //!   With this method, the event filter also estimates the fade ([`super::drift`]).
 //! * `Nominal`: as in the paper, charge divided by a nominal swing, with a fixed variance.
 
@@ -30,8 +29,8 @@ use crate::filter::{Measurement, ScalarGaussian};
 use crate::quantity::bounds;
 use crate::quantity::{InvalidState, Mode, Timestamp};
 
-/// If two capacities differ by more than this many standard deviations of their difference, one of them is wrong. It
-/// applies to a measured and the expected capacity, and to two measurements of one half-cycle.
+/// If a measured capacity and the expected capacity differ by more than this many standard deviations of their
+/// difference, one of them is wrong.
 const CONTRADICTION: f64 = 4.0;
 
 /// With the model of a label, a capacity counts as learned if its variance is below this part of the initial variance.
@@ -425,7 +424,7 @@ impl Learner {
             let (own, curve_ah) = (1.0 - by_curve, estimator.curve().mean);
             Measurement { value: curve_ah + (z.value - curve_ah) / own, variance: z.variance / (own * own) }
         });
-        let measurement = measurement.map(|z| agreed(z, half_cycle)).or(by_label);
+        let measurement = measurement.or(by_label);
         let drift = &mut self.drift[cell];
         let before = *drift;
         let expected = drift.capacity();
@@ -526,25 +525,6 @@ impl Learner {
         marks.chain(self.span.marks_mut()).for_each(|mark| mark.time = mark.time.plus_nanos(by_nanos));
         self.mode_since = self.mode_since.map(|since| since.plus_nanos(by_nanos));
     }
-}
-
-/// Compares the sample filter's measurement of the capacity, `filtered`, with the charge that moved, divided by the SOC
-/// swing. If the two differ by at most [`CONTRADICTION`], returns `filtered`. Otherwise returns the middle of both, with
-/// half of their difference as standard deviation.
-///
-/// The two contradict each other along a flat curve: there, an error of the curve moves the capacity in the sample
-/// filter by many of its standard deviations, but it does not move the SOC at the steep ends of the curve.
-fn agreed(filtered: Measurement, half_cycle: &HalfCycle) -> Measurement {
-    let Some(swing) = half_cycle.swing.filter(|swing| swing.mean > CONTRADICTION * swing.std()) else {
-        return filtered;
-    };
-    let by_charge = half_cycle.charge_ah / swing.mean;
-    let by_charge_variance = by_charge * by_charge * swing.variance / (swing.mean * swing.mean);
-    let difference = filtered.value - by_charge;
-    if difference * difference <= CONTRADICTION * CONTRADICTION * (filtered.variance + by_charge_variance) {
-        return filtered;
-    }
-    Measurement { value: 0.5 * (filtered.value + by_charge), variance: 0.25 * difference * difference }
 }
 
 /// One cell's half-cycle between the marks `a` and `b`. `moved_ah` is positive for a discharge.

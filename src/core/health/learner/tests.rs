@@ -230,37 +230,3 @@ fn doubtful_charge_ends_span_and_teaches_nothing() {
     assert!((capacity.mean - 1.6).abs() < 2.0 * capacity.std(), "{capacity:?}");
     assert!(capacity.std() > learned_by_label(false).capacity(0).std(), "{capacity:?}");
 }
-
-/// A half-cycle that moved 1.02 Ah over a swing of 0.96 +- `swing_std`.
-fn whole_discharge(swing_std: f64) -> HalfCycle {
-    HalfCycle {
-        mode: Mode::Discharge,
-        charge_ah: 1.02,
-        swing: Some(ScalarGaussian::from_std(0.96, swing_std)),
-        end_soc: Some(0.02),
-        ends: Some([0.98, 0.02]),
-        duration_s: 8000.0,
-        mean_current_a: 0.46,
-        mean_temperature_c: Some(20.0),
-    }
-}
-
-#[test]
-fn filter_against_counted_charge_gives_capacity_between() {
-    let filtered = Measurement { value: 0.944, variance: 0.009 * 0.009 };
-    let by_charge = 1.02 / 0.96;
-    let measured = agreed(filtered, &whole_discharge(0.008));
-    assert!((measured.value - 0.5 * (0.944 + by_charge)).abs() < 1e-12, "{measured:?}");
-    assert!((measured.variance.sqrt() - 0.5 * (by_charge - 0.944)).abs() < 1e-12, "{measured:?}");
-}
-
-#[test]
-fn filter_in_agreement_with_counted_charge_stays() {
-    let near = Measurement { value: 1.05, variance: 0.009 * 0.009 };
-    assert_eq!(agreed(near, &whole_discharge(0.008)), near);
-    // A swing that is as uncertain as this one contradicts nothing.
-    let far = Measurement { value: 0.944, variance: 0.009 * 0.009 };
-    assert_eq!(agreed(far, &whole_discharge(0.06)), far);
-    assert_eq!(agreed(far, &whole_discharge(0.5)), far);
-    assert_eq!(agreed(far, &HalfCycle { swing: None, ..whole_discharge(0.008) }), far);
-}
