@@ -15,7 +15,6 @@ mod picture;
 mod prepare;
 mod range;
 mod request;
-mod slow_test;
 mod toml;
 mod verdict;
 

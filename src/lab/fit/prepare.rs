@@ -3,7 +3,6 @@
 
 use super::FitRequest;
 use super::limits::{DISCONNECTED_V, voltage_limits};
-use super::slow_test::SlowTest;
 use crate::error::LabError;
 use crate::ident::ageing;
 use crate::ident::fit::{self, FittedTables, OcvCurve, Residual};
@@ -21,7 +20,7 @@ const AGEING_CHARGE_SCALE: f64 = 0.6;
 pub(super) struct AnchoredPart {
     pub(super) file: usize,
     part: MeasuredPart,
-    pub(super) judged: Vec<bool>,
+    judged: Vec<bool>,
     /// Weight of each second of the part; `None` = computed from the covered SOC range and the kind of test.
     scale: Option<f64>,
 }
@@ -36,7 +35,7 @@ pub(super) struct FitInputs {
 
 /// Removes rows without current or voltage, and rows whose time runs backwards. A missing temperature gets the previous
 /// value or, at the start, the first known value.
-pub(super) fn clean(part: &MeasuredPart) -> MeasuredPart {
+fn clean(part: &MeasuredPart) -> MeasuredPart {
     let known = part.temperature_c.iter().copied().find(|t| t.is_finite());
     // Assumed for a file without temperatures (degrees Celsius).
     let mut temperature_c = known.unwrap_or(25.0);
@@ -70,7 +69,8 @@ pub(super) fn prepare(
     if let Some(first) = request.first_cycles {
         return ageing_sources(files, first, voltage_v, notes);
     }
-    let tests = slow.iter().map(|file| SlowTest::new(file, voltage_v.1)).collect::<Result<Vec<_>, _>>()?;
+    let mut tests = slow.iter().map(|file| slow_test(file, voltage_v.1)).collect::<Result<Vec<_>, _>>()?;
+    tests.sort_by(|a, b| a.temperature_c.total_cmp(&b.temperature_c));
     let taken = taken_out(request, files, voltage_v.1)?;
     let deepest_ah = taken.iter().flat_map(|(_, _, out)| out).fold(0.0_f64, |most, ah| most.max(*ah));
     let nearest = tests.iter().min_by(|a, b| (a.temperature_c - 25.0).abs().total_cmp(&(b.temperature_c - 25.0).abs()));
@@ -78,7 +78,7 @@ pub(super) fn prepare(
         (Some(given), _) => given,
         (None, Some(test)) => {
             notes.push(format!("capacity from the slow test at {:.0} degrees C", test.temperature_c));
-            test.capacity_ah()
+            test.out_ah[test.out_ah.len() - 1]
         }
         (None, None) => {
             notes.push("capacity is the deepest discharge in the data (no --capacity given)".into());
@@ -90,20 +90,14 @@ pub(super) fn prepare(
     }
     let sources = taken.into_iter().map(|(file, mut part, out_ah)| {
         part.soc = out_ah.iter().map(|ah| 1.0 - ah / capacity_ah).collect();
-        AnchoredPart::unscaled(file, part, vec![])
+        AnchoredPart { file, part, judged: vec![], scale: None }
     });
     let mut sources: Vec<AnchoredPart> = sources.collect();
-    let mut ocv: Vec<OcvCurve> = tests.iter().map(|test| test.curve(capacity_ah)).collect();
-    ocv.sort_by(|a, b| a.temperature_c.total_cmp(&b.temperature_c));
-    sources.extend(tests.into_iter().zip(files.len()..).map(|(test, number)| test.into_source(number, capacity_ah)));
+    let slow_sources =
+        slow.iter().enumerate().map(|(k, file)| slow_source(file, files.len() + k, voltage_v.1, capacity_ah));
+    sources.extend(slow_sources.collect::<Result<Vec<_>, _>>()?);
+    let ocv = tests.iter().map(|test| test.curve(capacity_ah)).collect();
     Ok(FitInputs { sources, capacity_ah, voltage_v, ocv, notes })
-}
-
-impl AnchoredPart {
-    /// A part whose weight is computed from the covered SOC range and the kind of test.
-    pub(super) fn unscaled(file: usize, part: MeasuredPart, judged: Vec<bool>) -> Self {
-        Self { file, part, judged, scale: None }
-    }
 }
 
 /// File number, part, and for every row the charge taken out since the cell was full (Ah).
@@ -128,9 +122,64 @@ fn key_text(part: &MeasuredPart) -> String {
     if part.key.is_empty() { String::new() } else { format!(" part {}", part.key) }
 }
 
-pub(super) fn rough_capacity(part: &MeasuredPart) -> f64 {
+fn rough_capacity(part: &MeasuredPart) -> f64 {
     let out = crate::ident::charge_ah(&part.time_s, &part.current_a);
     out.iter().fold(0.0_f64, |most, ah| most.max(*ah))
+}
+
+struct SlowDischarge {
+    temperature_c: f64,
+    out_ah: Vec<f64>,
+    voltage_v: Vec<f64>,
+}
+
+impl SlowDischarge {
+    fn curve(&self, capacity_ah: f64) -> OcvCurve {
+        let soc = self.out_ah.iter().rev().map(|ah| 1.0 - ah / capacity_ah).collect();
+        let voltage_v = self.voltage_v.iter().rev().copied().collect();
+        OcvCurve { temperature_c: self.temperature_c, soc, voltage_v }
+    }
+}
+
+fn slow_test(file: &MeasuredFile, voltage_max_v: f64) -> Result<SlowDischarge, LabError> {
+    let fail = |what: String| LabError::Data(format!("{}: {what}", file.path.display()));
+    let part = clean(&file.parts[0]);
+    if part.time_s.is_empty() {
+        return Err(fail("no row with current and voltage".into()));
+    }
+    let out_ah = part.taken_out_ah(voltage_max_v, rough_capacity(&part)).map_err(fail)?;
+    let begin = part.current_a.iter().position(|&i| i > 0.0).ok_or_else(|| fail("no discharge".into()))?;
+    let len = part.current_a[begin..].iter().take_while(|&&i| i > 0.0).count();
+    let mut test = SlowDischarge { temperature_c: 0.0, out_ah: vec![], voltage_v: vec![] };
+    let mut sum_c = 0.0;
+    for (k, &ah) in out_ah.iter().enumerate().skip(begin).take(len) {
+        if test.out_ah.last().is_none_or(|&last| ah > last) && part.voltage_v[k] > DISCONNECTED_V {
+            test.out_ah.push(ah);
+            test.voltage_v.push(part.voltage_v[k]);
+            sum_c += part.temperature_c[k];
+        }
+    }
+    let whole_ah = out_ah.iter().fold(0.0_f64, |most, ah| most.max(*ah));
+    if test.out_ah.len() < 10 || test.out_ah[test.out_ah.len() - 1] < 0.5 * whole_ah {
+        return Err(fail(format!("its first discharge has {} rows, expected a whole slow one", test.out_ah.len())));
+    }
+    test.temperature_c = sum_c / test.out_ah.len() as f64;
+    Ok(test)
+}
+
+fn slow_source(
+    file: &MeasuredFile,
+    number: usize,
+    voltage_max_v: f64,
+    capacity_ah: f64,
+) -> Result<AnchoredPart, LabError> {
+    let mut part = clean(&file.parts[0]);
+    let out_ah = part.taken_out_ah(voltage_max_v, capacity_ah);
+    let out_ah = out_ah.map_err(|e| LabError::Data(format!("{}: {e}", file.path.display())))?;
+    let most = out_ah.iter().enumerate().fold(0, |most, (k, ah)| if *ah > out_ah[most] { k } else { most });
+    let judged = (0..out_ah.len()).map(|k| k <= most).collect();
+    part.soc = out_ah.iter().map(|ah| 1.0 - ah / capacity_ah).collect();
+    Ok(AnchoredPart { file: number, part, judged, scale: None })
 }
 
 fn need_cycles(files: &[MeasuredFile]) -> Result<(), LabError> {
