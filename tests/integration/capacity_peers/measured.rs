@@ -39,9 +39,8 @@ fn seconds(stamp: &str) -> f64 {
         + stamp[17..].parse::<f64>().unwrap()
 }
 
-/// The shipped configuration of `cell`. The initial capacity is wrong by the factor `start`. If `held`, the
-/// capacity is not learned.
-fn configuration(folder: &Path, cell: &str, start: f64, held: bool) -> PathBuf {
+/// The shipped configuration of `cell`. The initial capacity is wrong by the factor `start`.
+fn configuration(folder: &Path, cell: &str, start: f64) -> PathBuf {
     let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
     let mut text = std::fs::read_to_string(shipped.join("measured.toml")).unwrap();
     let model = format!("cells/nasa_{}.toml", cell.to_lowercase());
@@ -50,11 +49,6 @@ fn configuration(folder: &Path, cell: &str, start: f64, held: bool) -> PathBuf {
     }
     let new_ah = if cell == "B0005" { 1.9216 } else { 2.1059 };
     text = text.replace("[pack]\n", &format!("[pack]\ninitial_capacity_ah = {}\n", start * new_ah));
-    if held {
-        // The capacity measurements get such a large variance that they do not change the capacity either.
-        let fixed = "[capacity]\nmethod = \"nominal\"\nnominal_swing = 0.9\nnominal_variance_ah2 = 1e6\nnoise_ah_per_cycle = 0.0\n";
-        text = text.replace("[capacity]\n", fixed) + "\n[estimator]\ncapacity_state = \"held\"\n";
-    }
     let path = folder.join("config.toml");
     std::fs::write(&path, text).unwrap();
     path
@@ -262,13 +256,11 @@ fn usable_capacity_of_whole_lives_matches_best_peer() {
     heading();
     for cell in ["B0005", "B0006"] {
         let (name, rows) = (format!("{cell} from 0.8"), data.join(format!("{cell}.csv.gz")));
-        let life = live(&configuration(folder.path(), cell, 0.8, false), &rows, &data, cell);
-        let held = live(&configuration(folder.path(), cell, 0.8, true), &rows, &data, cell);
+        let life = live(&configuration(folder.path(), cell, 0.8), &rows, &data, cell);
         let ours = print_ours(&name, &life);
         let rested = least_ah(&print_peers(&name, "voltage, rested", &life, &life.outer));
         let loaded = least_ah(&print_peers(&name, "voltage, loaded", &life, &life.loaded));
         let filter = least_ah(&print_peers(&name, "filter", &life, &life.filter));
-        print_peers(&name, "filter, capacity held", &held, &held.filter);
         assert!(ours.mean_absolute <= rested.min(loaded) + LEVEL_AH, "{cell}: {ours:?}, peers {rested} {loaded}");
         assert!(ours.mean_absolute <= filter + NEAR_AH, "{cell}: {ours:?}, the best on the filter's SOC {filter}");
     }
@@ -290,7 +282,7 @@ fn usable_capacity_from_windows_matches_best_peer() {
     for (cell, seed) in [("B0005", 3), ("B0005", 4), ("B0006", 3), ("B0006", 4)] {
         let name = format!("{cell} in windows, seed {seed}");
         windowed(&data.join(format!("{cell}.csv.gz")), &rows, seed, WindowUnit::Charge);
-        let life = live(&configuration(folder.path(), cell, 1.0, false), &rows, &data, cell);
+        let life = live(&configuration(folder.path(), cell, 1.0), &rows, &data, cell);
         ours.push(print_ours(&name, &life));
         peers.push(print_peers(&name, "voltage, loaded", &life, &life.loaded));
         print_peers(&name, "filter", &life, &life.filter_at_ends);
