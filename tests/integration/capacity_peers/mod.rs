@@ -9,6 +9,7 @@
 //! - `voltage`: the SOC at both ends from the inverted open-circuit curve (`swings`). The peer's present capacity
 //!   estimate is used only to compute how ageing changes the shape of the curve.
 //! - `filter, capacity held`: like `filter`, but the filter keeps a wrong initial capacity and does not learn it.
+//!   Only the simulated lives are computed with it.
 //!
 //! The published capacity of a measured cell is the charge delivered at 2 A, not the capacity between open-circuit
 //! voltages. Each peer's capacity is therefore converted with packwatch's calculation of the usable capacity. The
