@@ -249,7 +249,7 @@ const NEAR_AH: f64 = 0.006;
 const LEVEL_AH: f64 = 0.0025;
 
 #[test]
-#[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
+#[ignore = "takes minutes: tests/peers/run --only capacity"]
 fn usable_capacity_of_whole_lives_matches_best_peer() {
     let data = measured::path("nasa_pcoe_aging");
     let folder = tempfile::tempdir().unwrap();
@@ -272,7 +272,7 @@ const LEVEL: f64 = 1.1;
 /// After a gap, the swing and the charge of a `half_cycle` event can disagree. Therefore the filter's swings use the
 /// same ends as the voltage swings.
 #[test]
-#[cfg_attr(not(measured_data), ignore = "no measured data (PACKWATCH_DATA)")]
+#[ignore = "takes minutes: tests/peers/run --only capacity"]
 fn usable_capacity_from_windows_matches_best_peer() {
     let data = measured::path("nasa_pcoe_aging");
     let folder = tempfile::tempdir().unwrap();

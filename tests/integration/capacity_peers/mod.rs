@@ -16,7 +16,8 @@
 //! conversion uses the same resistance and the same SOC of a full cell for all peers, so that only the capacities
 //! differ.
 //!
-//! `cargo test --workspace --test integration capacity_peers -- --nocapture` prints the tables of tests/candidates.md.
+//! `tests/peers/run --only capacity` runs the comparisons, which take minutes, and prints the tables of
+//! tests/candidates.md. `tests/all` only tests the peers themselves.
 
 mod least_squares;
 mod measured;

@@ -28,11 +28,12 @@ fn untaught() -> OwnModel {
 /// Models of vehicles whose cells are well known. The mean cell of all vehicles differs from the label. The curves,
 /// resistances and capacities of the vehicles differ from the mean cell with the given standard deviations (V, ln, Ah).
 fn taught(count: u32, [curve_v, log_resistance, capacity_ah]: [f64; 3]) -> Vec<OwnModel> {
+    let untaught = untaught();
     let vehicle = |k: u32| {
         // Each property orders the vehicles differently. Its values are evenly spread with a variance of 1.
         let place = |step: u32| (f64::from(k * step % count) + 0.5) / f64::from(count) - 0.5;
         let [a, b, c] = [1, 3, 7].map(|step| 12_f64.sqrt() * place(step));
-        let mut own = untaught();
+        let mut own = untaught.clone();
         own.curve_v.iter_mut().for_each(|v| *v += 0.02 + curve_v * a);
         own.modes_v = [[0.0; SOC_NODES]; 2];
         own.rest_v = [0.004; SOC_NODES];
