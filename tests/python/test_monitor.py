@@ -363,7 +363,7 @@ def test_signal_handler_cannot_use_interrupted_monitor():
 def test_results_before_signal_come_with_next_call():
     time_s, current_a, voltage_v = long(20_000_000)
     monitor = pw.Monitor(PAPER, estimates_period_s=60.0)
-    interrupted(lambda: monitor.rows(time_s, current_a, voltage_v))
+    interrupted(lambda: monitor.rows(time_s, current_a, voltage_v), after_s=1.5)
     out = monitor.finish().estimates
     again = monitor.finish().estimates
     taken = int(out["time_s"][-1]) + 60
